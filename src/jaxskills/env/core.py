@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The environment: a character that follows a reference, one environment per call.
+
+`reset` and `step` are pure functions of one environment; the rollout vmaps them, in one place. The
+action is a displacement of the servo targets from the reference (SB fig. 4, FS eq. 4).
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxskills import ground, kinematics, pose
+from jaxskills.character import Character
+from jaxskills.env import bounds as bounds_lib
+from jaxskills.env import observe, rewards
+from jaxskills.errors import UserError
+from jaxskills.kinematics import Bodies
+from jaxskills.motion import CONTROL_DT, Motion, sample
+from jaxskills.physics import Physics, SimState, servo
+
+# How an episode may end besides leaving a named bound.
+OTHER_ENDINGS = ("ground contact", "fall", "diverged", "time limit")
+
+# A start is lifted this far out of the floor; a motion's last pose is held this long.
+_LIFT_MARGIN = 1e-3  # m
+_HOLD = 15.0  # control frames
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """What an episode is."""
+
+    substeps: int = 4  # physics steps in a control step of 1/30 s: 120 Hz
+    seconds: float = 20.0  # longest episode, SB Table 1
+    # Control frames the feed-forward target is ahead of the state. A servo lags its target by kd/kp,
+    # 0.1 s for the DeepMimic gains; FS eq. 4 has 1.
+    lead: float = 3.0
+    feedforward: bool = True  # off: displacements are from the zero pose, not from the reference
+    reward: Literal["survival", "imitation"] = "survival"
+    stop: Literal["bounds", "fall"] = "bounds"  # what ends an episode; DeepMimic: a fall
+    heading: Literal["forward", "lateral"] = "forward"  # lateral for backflips and rolls, SB 4.1
+
+
+@struct.dataclass
+class EnvState:
+    """One environment between control steps."""
+
+    sim: SimState
+    phase: jax.Array  # [] control frames since the start of the reference's first cycle
+    step: jax.Array  # [] int32, control steps since the episode began
+    variant: jax.Array  # [] int32, which compiled model it runs
+
+
+@struct.dataclass
+class Report:
+    """What one step looked like, for people and plots; nothing is computed from it."""
+
+    errors: jax.Array  # [K] m or rad
+    sizes: jax.Array  # [K] of the bounds
+    inside: jax.Array  # [] bool
+    fallen: jax.Array  # [] bool
+    ended_by: jax.Array  # [] int32 into `Environment.endings`, meaningful when an episode ended
+    com: jax.Array  # [3] m
+    torque: jax.Array  # [nu] N m, applied at the end of the step
+
+
+@struct.dataclass
+class Outcome:
+    """What a step gives to learning."""
+
+    obs: jax.Array  # [O] after the step
+    rate: jax.Array  # [] reward per control frame of phase, received continuously
+    spike: jax.Array  # [] reward received at once
+    dphase: jax.Array  # [] control frames of phase that went by
+    terminated: jax.Array  # [] bool, the future is worth nothing
+    truncated: jax.Array  # [] bool, cut off: the future goes on unseen
+    report: Report
+
+
+class Environment(NamedTuple):
+    """Pure functions of one environment, and their sizes."""
+
+    start: Callable[[jax.Array], EnvState]  # (phase []) -> a state on the reference there
+    observe: Callable[[EnvState], jax.Array]  # (state) -> obs [O]
+    step: Callable[[EnvState, jax.Array], tuple[EnvState, Outcome]]  # (state, action [A])
+    action_size: int
+    endings: tuple[str, ...]  # the K bounds, then `OTHER_ENDINGS`
+    length: float  # control frames in a cycle of the reference
+
+
+class _Seen(NamedTuple):
+    """What both the observation and the bounds need of a state."""
+
+    bodies: Bodies
+    reference: Bodies
+    offset: jax.Array
+    velocity_error: jax.Array
+    effectors: tuple[jax.Array, jax.Array]
+
+
+def make(
+    character: Character,
+    motion: Motion,
+    physics: Physics,
+    model: object,
+    bounds: bounds_lib.Bounds,
+    config: EnvConfig,
+) -> Environment:
+    """Returns the environment of a character that follows `motion`.
+
+    Args:
+      character: who.
+      motion: the reference.
+      physics: the engine's functions.
+      model: what `physics.load` returned.
+      bounds: sizes of the spacetime bounds.
+      config: what an episode is.
+    """
+    validate(config)
+    layout, tree = character.layout, kinematics.tree(character.model)
+    params, shapes = kinematics.body_params(character.model), ground.shapes(character.model)
+    servos, weights = servo.of(character), rewards.imitation_weights(character)
+    effectors = tuple(character.body(name) for name in character.end_effectors)
+    forward = character.forward / np.linalg.norm(character.forward)
+    lateral = np.cross([0.0, 0.0, 1.0], forward)
+    axis = jnp.asarray(forward if config.heading == "forward" else lateral, jnp.float32)
+    allowed = {character.body(name) for name in character.ground}
+    no_touch = np.array([i for i in range(len(character.body_names)) if i not in allowed])
+    forbidden = np.array(bounds.forbidden, int)
+    dofs = np.array(servos.dofs)
+    neutral = jnp.asarray(character.model.qpos0, jnp.float32)
+    max_steps = round(config.seconds / CONTROL_DT)
+    last_phase = jnp.inf if motion.loop else motion.length + _HOLD
+    endings = (*bounds.names, *OTHER_ENDINGS)
+
+    def bodies_of(qpos: jax.Array, qvel: jax.Array) -> Bodies:
+        return kinematics.kinematics(tree, params, qpos, qvel)
+
+    def look(state: EnvState) -> _Seen:
+        qpos, qvel = state.sim.qpos, state.sim.qvel
+        ref_qpos, ref_qvel = sample(layout, motion, state.phase)
+        # Simulation and reference in one batch: half the code to compile.
+        pair = jax.vmap(bodies_of)(jnp.stack((qpos, ref_qpos)), jnp.stack((qvel, ref_qvel)))
+        bodies, reference = (jax.tree.map(lambda x: x[i], pair) for i in range(2))  # noqa: B023
+        both = [bounds_lib.heading_effectors(b, effectors, axis) for b in (bodies, reference)]
+        offset = pose.minus(layout, ref_qpos, qpos)
+        return _Seen(bodies, reference, offset, ref_qvel - qvel, (both[0], both[1]))
+
+    def features(state: EnvState, seen: _Seen) -> jax.Array:
+        return observe.features(
+            seen.bodies,
+            seen.reference,
+            seen.offset,
+            state.phase,
+            motion.length,
+            axis,
+            seen.effectors[0],
+        )
+
+    def start(phase: jax.Array) -> EnvState:
+        qpos, qvel = sample(layout, motion, phase)
+        lowest = jnp.min(ground.clearance(shapes, bodies_of(qpos, qvel)))
+        qpos = qpos.at[2].add(jnp.maximum(_LIFT_MARGIN - lowest, 0.0))
+        sim = physics.init(model, jnp.int32(0), qpos, qvel)
+        return EnvState(sim, phase, jnp.int32(0), jnp.int32(0))
+
+    def observe_state(state: EnvState) -> jax.Array:
+        return features(state, look(state))
+
+    def control(state: EnvState, action: jax.Array) -> jax.Array:
+        base = neutral
+        if config.feedforward:
+            base, _ = sample(layout, motion, state.phase + config.lead)
+        d = jnp.zeros(layout.nv).at[dofs].set(action)
+        return servo.set_point(
+            servos, layout, state.sim.qpos, state.sim.qvel, pose.plus(layout, base, d)
+        )
+
+    def step(state: EnvState, action: jax.Array) -> tuple[EnvState, Outcome]:
+        ctrl = control(state, action)
+        sim = physics.step(model, state.variant, state.sim, ctrl)
+        dphase = jnp.float32(1.0)
+        state = EnvState(sim, state.phase + dphase, state.step + 1, state.variant)
+        seen = look(state)
+        errors = bounds_lib.errors(
+            layout, seen.offset, seen.bodies, seen.reference, seen.effectors
+        )
+        sizes = bounds_lib.sizes(bounds, state.phase, motion.length)
+        clear = ground.clearance(shapes, seen.bodies)
+        fallen = jnp.any(clear[no_touch] <= 0.0)
+        touching = jnp.any(clear[forbidden] <= 0.0)
+        diverged = sim.diverged | ~jnp.all(jnp.isfinite(errors))
+        inside = jnp.all(errors <= sizes) & ~touching & ~diverged
+        terminated = fallen | diverged if config.stop == "fall" else ~inside
+        truncated = (state.step >= max_steps) | (state.phase >= last_phase)
+        worst = jnp.argmax(errors / sizes).astype(jnp.int32)
+        others = len(bounds.names) + jnp.arange(len(OTHER_ENDINGS), dtype=jnp.int32)
+        by_bound = jnp.where(jnp.any(errors > sizes), worst, others[0])
+        ended_by = jnp.where(config.stop == "fall", others[1], by_bound)
+        ended_by = jnp.where(diverged, others[2], jnp.where(terminated, ended_by, others[3]))
+        reward = jnp.float32(1.0)
+        if config.reward == "imitation":
+            reward = rewards.imitation(
+                weights,
+                seen.offset,
+                seen.velocity_error,
+                seen.effectors,
+                seen.bodies,
+                seen.reference,
+            )
+        report = Report(
+            errors,
+            sizes,
+            inside,
+            fallen,
+            ended_by,
+            seen.bodies.com,
+            servo.applied_torque(servos, layout, sim.qpos, sim.qvel, ctrl),
+        )
+        outcome = Outcome(
+            obs=features(state, seen),
+            rate=jnp.float32(0.0),
+            spike=jnp.where(terminated, 0.0, reward),
+            dphase=dphase,
+            terminated=terminated,
+            truncated=truncated & ~terminated,
+            report=report,
+        )
+        return state, outcome
+
+    return Environment(start, observe_state, step, len(dofs), endings, float(motion.length))
+
+
+def validate(config: EnvConfig) -> None:
+    """Checks a configuration.
+
+    Raises:
+      UserError: a value out of range.
+    """
+    if not 1 <= config.substeps <= 100:
+        raise UserError(f"env.substeps is {config.substeps}: give 1 to 100 (20 is 600 Hz)")
+    if not CONTROL_DT <= config.seconds <= 3600:
+        raise UserError(f"env.seconds is {config.seconds}: give 1/30 to 3600 s")
+    if not -30 <= config.lead <= 30:
+        raise UserError(f"env.lead is {config.lead}: give -30 to 30 control frames")

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evaluation: does the skill stand, for how long, and how close to the reference.
+
+As in SB Table 1, bounds do not end an evaluated episode: a fall does, that is any body on the floor
+that the character may not stand on. Actions are the policy's mean, starts are random phases.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from flax import struct
+
+from jaxskills import trainer as trainer_lib
+from jaxskills.env.core import Environment
+from jaxskills.errors import UserError
+from jaxskills.learn import normalize, rollout
+from jaxskills.learn.networks import Networks
+from jaxskills.motion import CONTROL_DT
+from jaxskills.trainer import Trainer, TrainState
+
+SUCCESS_RATE = 0.95  # of episodes that last `seconds`, when a skill counts as learnt
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateConfig:
+    """What is measured."""
+
+    seconds: float = 20.0  # SB Table 1
+    episodes: int = 64
+    substeps: int | None = None  # physics steps per control step; 20 is SB's 600 Hz
+    seed: int = 1
+
+
+@struct.dataclass
+class Trace:
+    """T steps of E evaluated episodes, going on after a fall."""
+
+    qpos: jax.Array  # [T, E, nq]
+    phase: jax.Array  # [T, E] control frames
+    errors: jax.Array  # [T, E, K] m or rad
+    sizes: jax.Array  # [T, E, K] of the bounds
+    inside: jax.Array  # [T, E] bool
+    fallen: jax.Array  # [T, E] bool, or diverged
+    com: jax.Array  # [T, E, 3] m
+    torque: jax.Array  # [T, E, nu] N m
+
+
+def make(trainer: Trainer, config: EvaluateConfig) -> Callable[[TrainState, jax.Array], Trace]:
+    """Returns the function (state, key) -> Trace, to be jitted.
+
+    Raises:
+      UserError: a value out of range.
+    """
+    if not CONTROL_DT <= config.seconds <= 3600:
+        raise UserError(f"seconds is {config.seconds}: give 1/30 to 3600")
+    if not 1 <= config.episodes <= 65536:
+        raise UserError(f"episodes is {config.episodes}: give 1 to 65536")
+    changed = dataclasses.replace(
+        trainer.config.env,
+        stop="fall",
+        seconds=3600.0,
+        substeps=config.substeps or trainer.config.env.substeps,
+    )
+    env = trainer_lib.environment(
+        dataclasses.replace(trainer.config, env=changed),
+        trainer.character,
+        trainer.motion,
+        config.episodes,
+    )
+    steps = round(config.seconds / CONTROL_DT)
+    return lambda state, key: run(env, trainer.networks, state, key, config.episodes, steps)
+
+
+def run(
+    env: Environment, nets: Networks, state: TrainState, key: jax.Array, episodes: int, steps: int
+) -> Trace:
+    """Returns the trace of `episodes` from random phases. The key is consumed."""
+    phase = jax.random.uniform(key, (episodes,)) * env.length
+
+    def advance(now: rollout.Fresh, _: None) -> tuple[rollout.Fresh, Trace]:
+        mean = nets.mean(state.learner.policy, normalize.apply(state.normalizer, now.obs))
+        states, outcome = jax.vmap(env.step)(now.state, mean)
+        report = outcome.report
+        seen = Trace(
+            states.sim.qpos,
+            states.phase,
+            report.errors,
+            report.sizes,
+            report.inside,
+            report.fallen | states.sim.diverged,
+            report.com,
+            report.torque,
+        )
+        return rollout.Fresh(states, outcome.obs), seen
+
+    _, trace = jax.lax.scan(advance, rollout.begin(env, phase), None, length=steps)
+    return trace
+
+
+def summary(trace: Trace) -> dict[str, float]:
+    """Returns the figures of a trace.
+
+    `success_rate`: share of episodes without a fall. `seconds_mean`: mean time until the fall or
+    the end. `inside_bounds_rate`: share of episodes that never left the bounds;
+    `inside_seconds_mean`: mean time until they first did.
+    """
+    fallen, outside = np.asarray(trace.fallen), ~np.asarray(trace.inside)
+    return {
+        "success_rate": float(1.0 - fallen.any(0).mean()),
+        "seconds_mean": float(_first(fallen).mean() * CONTROL_DT),
+        "inside_bounds_rate": float(1.0 - outside.any(0).mean()),
+        "inside_seconds_mean": float(_first(outside).mean() * CONTROL_DT),
+        "episodes": fallen.shape[1],
+    }
+
+
+def _first(mask: np.ndarray) -> np.ndarray:
+    """Returns per episode `[E]` how many steps come before the first true one in `mask [T, E]`."""
+    return np.where(mask.any(0), mask.argmax(0), len(mask))

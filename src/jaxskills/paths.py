@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where shipped files lie, in a checkout and in an installed wheel, and where clips are found."""
+
+import importlib.util
+import os
+from pathlib import Path
+
+from jaxskills.errors import UserError
+
+_PACKAGE = Path(__file__).resolve().parent
+
+CLIP_DIR_VARIABLE = "JAXSKILLS_CLIP_DIR"
+
+
+def shipped(folder: str) -> Path:
+    """Returns the folder of shipped files: inside the wheel, or beside `src/` in a checkout."""
+    in_wheel = _PACKAGE / folder
+    return in_wheel if in_wheel.is_dir() else _PACKAGE.parents[1] / folder
+
+
+def data_dir() -> Path:
+    """Returns the folder with `characters/` and `clips/`."""
+    return shipped("data")
+
+
+def deepmimic_dir() -> Path:
+    """Returns the folder of the DeepMimic motion files (`humanoid3d_*.txt`).
+
+    `JAXSKILLS_CLIP_DIR` wins; otherwise the `pybullet_data` package of the `clips` extra. Only
+    its files are read: the simulator is never imported.
+
+    Raises:
+      UserError: neither is there; the message names the extra and the variable.
+    """
+    named = os.environ.get(CLIP_DIR_VARIABLE)
+    if named:
+        if not Path(named).is_dir():
+            raise UserError(f"{CLIP_DIR_VARIABLE}='{named}' is not a folder: name one with clips")
+        return Path(named)
+    spec = importlib.util.find_spec("pybullet_data")
+    if spec is None or spec.origin is None:
+        raise UserError(
+            "the DeepMimic motion files are not installed: run pip install 'jaxskills[clips]',"
+            f" or set {CLIP_DIR_VARIABLE} to a folder that holds them"
+        )
+    return Path(spec.origin).parent / "data" / "motions"

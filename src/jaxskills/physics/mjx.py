@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""MJX, MuJoCo in XLA: `impl='jax'` for any accelerator, `impl='warp'` for NVIDIA.
+
+Both carry the same small state as the cpu backend: what else MJX keeps in its Data follows from
+coordinates, velocities and warm start, so it is rebuilt from a template at each control step.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import batch, mjx
+
+from jaxskills.errors import UserError
+from jaxskills.physics.base import Physics, SimState, admit, check, settle, start
+
+MARGIN = 2
+"""Contact and constraint capacity for Warp, as a multiple of what a C rollout reached."""
+
+
+@flax.struct.dataclass
+class MjxModel:
+    """A loaded set of W models.
+
+    Attributes:
+      shared: (mjx.Model, mjx.Data) of the first one; the Data is a template.
+      varied: [W, ...] each, the leaves of `shared` that differ between the models.
+      where: their positions among the leaves of `shared`.
+      home: [W, nq] float32, `qpos0` of each.
+    """
+
+    shared: tuple[mjx.Model, mjx.Data]
+    varied: tuple[jax.Array, ...]
+    home: jax.Array
+    where: tuple[int, ...] = flax.struct.field(pytree_node=False)
+
+
+def load(models: Sequence[mujoco.MjModel], impl: str, num_envs: int) -> MjxModel:
+    """Puts W models of equal sizes on the device and stacks what differs between them.
+
+    Raises:
+      UserError: no model, unequal sizes, a feature MJX lacks, or a difference that it cannot vary.
+    """
+    check(models)
+    sizes = capacity(models, num_envs) if impl == "warp" else {}
+    try:
+        worlds = [
+            (mjx.put_model(m, impl=impl), mjx.make_data(m, impl=impl, **sizes)) for m in models
+        ]
+    except NotImplementedError as error:
+        raise UserError(f"backend with impl '{impl}' cannot run this model: {error}") from None
+    leaves = [jax.tree.leaves(world) for world in worlds]
+    structure = jax.tree.structure(worlds[0])
+    if any(jax.tree.structure(world) != structure for world in worlds):
+        raise UserError(
+            "physics models differ in something MJX compiles in: vary masses, sizes, positions,"
+            " gains, gravity, friction, but not contact masks, types, flags or which limits exist"
+        )
+    columns = [[np.asarray(leaf) for leaf in column] for column in zip(*leaves, strict=True)]
+    where = tuple(
+        i for i, column in enumerate(columns) if any((x != column[0]).any() for x in column)
+    )
+    return MjxModel(
+        shared=worlds[0],
+        varied=tuple(jnp.asarray(np.stack(columns[i])) for i in where),
+        home=jnp.asarray(np.stack([m.qpos0 for m in models]), jnp.float32),
+        where=where,
+    )
+
+
+def capacity(models: Sequence[mujoco.MjModel], num_envs: int) -> dict[str, int]:
+    """Returns Warp's array sizes: `naconmax` contacts in all, `njmax` constraint rows per world.
+
+    Bodies are thrown on the floor in C for a second; `MARGIN` times the most they needed.
+    """
+    contacts, rows = 8, 32
+    random = np.random.default_rng(0)
+    for model in models[:8]:
+        drop = batch.Batch(model, 16)
+        drop.warning[...] = 1
+        qpos, qvel = drop.bind("qpos"), drop.bind("qvel")
+        for pose in qpos:
+            mujoco.mj_integratePos(model, pose, random.normal(size=model.nv), 1.0)
+        qvel[...] = random.normal(size=qvel.shape)
+        ncon, nefc = drop.bind("ncon"), drop.bind("nefc")
+        for _ in range(int(1.0 / model.opt.timestep)):
+            drop.step()
+            contacts, rows = max(contacts, ncon.max()), max(rows, nefc.max())
+    return {"naconmax": int(MARGIN * contacts * num_envs), "njmax": int(MARGIN * rows)}
+
+
+def _world(model: MjxModel, variant: jax.Array) -> tuple[mjx.Model, mjx.Data]:
+    """Returns the model and the template of one variant."""
+    leaves, structure = jax.tree.flatten(model.shared)
+    for i, stacked in zip(model.where, model.varied, strict=True):
+        leaves[i] = stacked[variant]
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _advance(world: tuple[mjx.Model, mjx.Data], state: SimState, ctrl: Any, substeps: int):
+    model, template = world
+
+    def substep(_, carry):
+        qpos, qvel, warmstart = carry
+        data = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
+        data = mjx.step(model, data)
+        return data.qpos, data.qvel, data.qacc_warmstart
+
+    end = jax.lax.fori_loop(0, substeps, substep, (state.qpos, state.qvel, state.engine))
+    return SimState(*end, diverged=jnp.zeros((), bool))
+
+
+def _advance_warp(world: tuple[mjx.Model, mjx.Data], state: SimState, ctrl: Any, substeps: int):
+    """Steps Warp's own Data, since its buffers are better kept than filled anew each substep."""
+    model, data = world
+    data = data.replace(
+        qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.engine, ctrl=ctrl
+    )
+    overflow = jnp.zeros((), bool)
+    for _ in range(substeps):
+        data = mjx.step(model, data)
+        overflow |= data._impl.overflow != 0
+    return SimState(data.qpos, data.qvel, data.qacc_warmstart, diverged=overflow)
+
+
+def make(impl: str, substeps: int, num_envs: int) -> Physics:
+    """Returns the mjx (`impl='jax'`) or the warp backend."""
+    advance = _advance_warp if impl == "warp" else _advance
+
+    def step(model: MjxModel, variant: jax.Array, state: SimState, ctrl: jax.Array) -> SimState:
+        ctrl = jnp.asarray(ctrl, jnp.float32)
+        before, ctrl = admit(model.home[variant], state, ctrl)
+        return settle(before, advance(_world(model, variant), before, ctrl, substeps))
+
+    return Physics(
+        load=functools.partial(load, impl=impl, num_envs=num_envs),
+        init=lambda model, variant, qpos, qvel: start(qpos, qvel),
+        step=step,
+    )

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training as one pure function over one state: `update(state) -> (state, metrics)`.
+
+`TrainState` holds everything needed to continue bit for bit; `save` and `restore` are in
+`checkpoint.py`, the loop that a person starts is in `train.py`.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxskills import character as character_lib
+from jaxskills import clip as clip_lib
+from jaxskills import motion as motion_lib
+from jaxskills import physics as physics_lib
+from jaxskills import retarget
+from jaxskills.character import Character
+from jaxskills.env import bounds as bounds_lib
+from jaxskills.env import core
+from jaxskills.errors import UserError
+from jaxskills.explore import starts as starts_lib
+from jaxskills.learn import gae, normalize, rollout
+from jaxskills.learn import networks as networks_lib
+from jaxskills.learn import ppo as ppo_lib
+from jaxskills.motion import CONTROL_DT, Motion
+
+PHASE_BINS = 20  # of the count of what ended episodes where
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides a run, besides the machine."""
+
+    clip: str = "walk"
+    character: str = "humanoid34"
+    backend: Literal["auto", "cpu", "mjx", "warp"] = "auto"
+    seed: int = 0
+    samples: int = 10_000_000  # at most; training stops before when the skill is learnt
+    envs: int = 256
+    horizon: int = 16  # control steps of each environment in an update
+    env: core.EnvConfig = core.EnvConfig()
+    bounds: bounds_lib.BoundsConfig = dataclasses.field(default_factory=bounds_lib.BoundsConfig)
+    motion: motion_lib.MotionConfig = motion_lib.MotionConfig()
+    starts: starts_lib.StartsConfig = starts_lib.StartsConfig()
+    networks: networks_lib.NetworkConfig = networks_lib.NetworkConfig()
+    ppo: ppo_lib.PPOConfig = ppo_lib.PPOConfig()
+
+
+@struct.dataclass
+class TrainState:
+    """One training run between two updates."""
+
+    learner: ppo_lib.Learner
+    normalizer: normalize.Normalizer
+    starts: starts_lib.Starts
+    current: rollout.Fresh  # the B environments and what they show
+    key: jax.Array  # root of all randomness; the number of updates is folded in
+    updates: jax.Array  # [] int32
+
+
+class Trainer(NamedTuple):
+    """A run's parts. `init` and `update` are pure and may be jitted, vmapped over seeds, scanned."""
+
+    config: TrainConfig
+    character: Character
+    motion: Motion
+    env: core.Environment
+    networks: networks_lib.Networks
+    init: Callable[[jax.Array], TrainState]  # (key) -> state
+    update: Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
+
+
+def reference(config: TrainConfig, character: Character) -> Motion:
+    """Returns the clip of a configuration as a motion of the character."""
+    clip = clip_lib.load(config.clip)
+    qpos = retarget.retarget(character, clip)
+    return motion_lib.from_qpos(character.model, qpos, clip.times, clip.loop, config.motion)
+
+
+def environment(
+    config: TrainConfig, character: Character, motion: Motion, envs: int
+) -> core.Environment:
+    """Returns the environment of a configuration, made for batches of `envs`."""
+    core.validate(config.env)
+    backend = physics_lib.default_backend() if config.backend == "auto" else config.backend
+    engine = physics_lib.make(backend, config.env.substeps, num_envs=envs)
+    timestep = CONTROL_DT / config.env.substeps
+    model = engine.load([character_lib.compile(character, timestep)])
+    bounds = bounds_lib.make(character, config.bounds)
+    return core.make(character, motion, engine, model, bounds, config.env)
+
+
+def make(config: TrainConfig) -> Trainer:
+    """Returns the trainer of a configuration.
+
+    Raises:
+      UserError: a value out of range, an unknown name, a broken clip or character.
+    """
+    validate(config)
+    character = character_lib.load(config.character)
+    motion = reference(config, character)
+    env = environment(config, character, motion, config.envs)
+    obs_size = jax.eval_shape(lambda: env.observe(env.start(jnp.float32(0.0)))).shape[0]
+    nets = networks_lib.make(config.networks, obs_size, env.action_size, config.ppo.discount)
+
+    def init(key: jax.Array) -> TrainState:
+        learner_key, start_key, key = jax.random.split(key, 3)
+        starts = starts_lib.init(config.starts)
+        phase = starts_lib.sample(config.starts, starts, start_key, config.envs, env.length)
+        current = rollout.begin(env, phase)
+        normalizer = normalize.update(normalize.init(obs_size), current.obs)
+        learner = ppo_lib.init(config.ppo, nets, learner_key)
+        return TrainState(learner, normalizer, starts, current, key, jnp.int32(0))
+
+    def update(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        key = jax.random.fold_in(state.key, state.updates)
+        start_key, act_key, learn_key = jax.random.split(key, 3)
+        phase = starts_lib.sample(config.starts, state.starts, start_key, config.envs, env.length)
+        current, steps = rollout.collect(
+            env,
+            nets,
+            state.learner.policy,
+            state.normalizer,
+            state.current,
+            rollout.begin(env, phase),
+            act_key,
+            config.horizon,
+        )
+        batch = to_batch(config.ppo, nets, state.learner, state.normalizer, steps)
+        learner, metrics = ppo_lib.update(config.ppo, nets, state.learner, batch, learn_key)
+        flat_obs = steps.obs.reshape(-1, obs_size)
+        starts = starts_lib.update(
+            config.starts, state.starts, steps.phase.reshape(-1), batch.target, env.length
+        )
+        metrics |= episode_metrics(env, steps)
+        new_state = TrainState(
+            learner,
+            normalize.update(state.normalizer, flat_obs),
+            starts,
+            current,
+            state.key,
+            state.updates + 1,
+        )
+        return new_state, metrics
+
+    return Trainer(config, character, motion, env, nets, init, update)
+
+
+def to_batch(
+    config: ppo_lib.PPOConfig,
+    nets: networks_lib.Networks,
+    learner: ppo_lib.Learner,
+    normalizer: normalize.Normalizer,
+    steps: rollout.Transition,
+) -> ppo_lib.Batch:
+    """Returns the transitions `[T, B]` as one batch `[T B]` with advantages and value targets."""
+    obs = normalize.apply(normalizer, steps.obs)
+    value = nets.value(learner.value, obs)
+    next_value = nets.value(learner.value, normalize.apply(normalizer, steps.next_obs))
+    ended = steps.terminated | steps.truncated
+    along_time = jax.vmap(gae.advantages, in_axes=(1,) * 7 + (None, None), out_axes=1)
+    advantage = along_time(
+        steps.rate,
+        steps.spike,
+        steps.dphase,
+        value,
+        next_value,
+        steps.terminated,
+        ended,
+        config.discount,
+        config.lambda_,
+    )
+    deviation = jnp.maximum(jnp.std(advantage), 1e-6)
+    scaled = (advantage - jnp.mean(advantage)) / deviation
+    flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
+    return jax.tree.map(
+        flat, ppo_lib.Batch(obs, steps.action, steps.log_prob, scaled, advantage + value)
+    )
+
+
+def episode_metrics(env: core.Environment, steps: rollout.Transition) -> dict[str, jax.Array]:
+    """Returns counts of an update, to be summed over updates by whoever shows them.
+
+    `steps` and `episodes` give the mean survival; `endings [E, PHASE_BINS]` says what ended
+    episodes at which phase.
+    """
+    ended = steps.terminated | steps.truncated
+    place = jnp.floor((steps.phase % env.length) / env.length * PHASE_BINS).astype(jnp.int32)
+    by_cause = jax.nn.one_hot(steps.ended_by, len(env.endings)) * ended[..., None]
+    by_phase = jax.nn.one_hot(jnp.clip(place, 0, PHASE_BINS - 1), PHASE_BINS)
+    return {
+        "steps": jnp.float32(ended.size),
+        "episodes": jnp.sum(ended, dtype=jnp.float32),
+        "diverged": jnp.sum(by_cause[..., env.endings.index("diverged")]),
+        "endings": jnp.einsum("tbe,tbp->ep", by_cause, by_phase),
+        "reward": jnp.mean(steps.spike + steps.rate),
+    }
+
+
+def validate(config: TrainConfig) -> None:
+    """Checks a configuration.
+
+    Raises:
+      UserError: a value out of range.
+    """
+    for name in ("envs", "horizon", "samples"):
+        if getattr(config, name) < 1:
+            raise UserError(f"{name} is {getattr(config, name)}: give 1 or more")
+    if not 0 <= config.seed < 2**32:
+        raise UserError(f"seed is {config.seed}: give 0 to {2**32 - 1}")
+    core.validate(config.env)
+    starts_lib.validate(config.starts)
+    ppo_lib.validate(config.ppo, config.envs * config.horizon)

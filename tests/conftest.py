@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every test shares: a throw-away home folder, calm CPU dispatch, the real clips if there."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import pytest
+
+from jaxskills.errors import UserError
+from jaxskills.paths import deepmimic_dir
+
+# MJX under vmap can wait for ever on two cores otherwise; it must be set before a backend starts.
+jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A home folder of its own for the whole session: no test reads or writes the user's."""
+    folder = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOME", str(folder))
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        patch.setenv("MPLBACKEND", "agg")
+        # The command line caches compiled code for its user; tests compile afresh.
+        patch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def deepmimic() -> Path:
+    """The folder of the DeepMimic motion files; tests that need it skip without the extra."""
+    try:
+        return deepmimic_dir()
+    except UserError as missing:
+        pytest.skip(str(missing))
