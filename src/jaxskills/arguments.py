@@ -3,7 +3,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro import conf
 
@@ -11,6 +11,7 @@ Skill = Annotated[str, conf.Positional, conf.arg(metavar="SKILL")]
 Run = Annotated[Path, conf.Positional, conf.arg(metavar="RUN")]
 File = Annotated[str, conf.Positional, conf.arg(metavar="CLIP")]
 Flag = Annotated[bool, conf.FlagCreatePairsOff]
+Backend = Literal["auto", "cpu", "mjx", "warp"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +44,8 @@ class Evaluate:
     """Physics steps per control step of 1/30 s (20: 600 Hz). None: as in the training."""
     seed: int = 1
     """Seed of the phases at which episodes start."""
+    backend: Backend = "auto"
+    """Physics engine; auto takes the best one for this machine, whatever the run learnt on."""
     json: Flag = False
     """Print one JSON object."""
 
@@ -56,7 +59,9 @@ class Render:
     out: Path
     """File to write: .mp4 for a film, .png for a film strip."""
     seconds: float = 10.0
-    """Length of the film in s."""
+    """Length of the film in s; it ends shortly after a fall."""
+    backend: Backend = "auto"
+    """Physics engine; auto takes the best one for this machine, whatever the run learnt on."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,18 +2,16 @@
 """What is wrong with a clip before anything is trained on it, in sentences a person can act on."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxskills import faults, measures, posed, retarget
+from jaxskills.character import Character
 from jaxskills.clip_data import Clip
 from jaxskills.faults import SEVERITIES, Finding
 from jaxskills.mapping import Mapping, guess_mapping, targets
-
-if TYPE_CHECKING:
-    from jaxskills.character import Character
 
 __all__ = ["SEVERITIES", "Finding", "Report", "check", "format_report"]
 
@@ -57,7 +55,7 @@ class Report:
         }
 
 
-def check(character: "Character", clip: Clip, mapping: Mapping | None = None) -> Report:
+def check(character: Character, clip: Clip, mapping: Mapping | None = None) -> Report:
     """Returns what a person should know before training on `clip`.
 
     The clip is posed on the character; named faults (`faults`) are found by trying their repair.
@@ -121,7 +119,7 @@ def format_report(report: Report) -> str:
 
 
 def _matching(
-    character: "Character",
+    character: Character,
     mapping: Mapping,
     unmatched: tuple[str, ...],
     undriven: tuple[str, ...],
@@ -141,7 +139,7 @@ def _matching(
         if np.degrees(lost.max()) > 10.0:
             text = (
                 f"{joint} turns up to {np.degrees(lost.max()):.0f} degrees off what its hinges can"
-                f" do (mean {np.degrees(lost.mean()):.0f}); joints below make up for it where they can"
+                f" do (mean {np.degrees(lost.mean()):.0f}); joints below make up for what they can"
             )
             severity = "warning" if np.degrees(lost.mean()) > 15.0 else "info"
             found.append(Finding(severity, "lost_rotation", text))
@@ -191,7 +189,7 @@ def _floor(view: posed.Look, lift: float, numbers: dict[str, float]) -> list[Fin
     if below > 0.5:
         middle = float(np.median(lowest))
         text = (
-            f"more than 3 cm in the floor {below:.0%} of the time, {-100 * middle:.0f} cm as a rule:"
+            f"more than 3 cm in the floor {below:.0%} of the time, {-100 * middle:.0f} cm mostly:"
             f" Mapping(lift={lift - middle:.3f})"
         )
         return [Finding("warning", "in_floor", text)]
@@ -232,7 +230,7 @@ def _speeds(clip: Clip, numbers: dict[str, float]) -> list[Finding]:
 
 
 def _limits(
-    character: "Character", moved: retarget.Transfer, numbers: dict[str, float]
+    character: Character, moved: retarget.Transfer, numbers: dict[str, float]
 ) -> list[Finding]:
     found, worst = [], 0.0
     for limit in measures.limits(character, moved.qpos):
@@ -286,7 +284,7 @@ def _relative(angle: float) -> str:
 
 
 def _sound(
-    character: "Character", clip: Clip, mapping: Mapping, found: list[Finding]
+    character: Character, clip: Clip, mapping: Mapping, found: list[Finding]
 ) -> list[Finding]:
     """Says what was looked for and not found."""
     codes = {finding.code for finding in found if finding.severity == "fault"}

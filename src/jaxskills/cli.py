@@ -28,36 +28,27 @@ PROGRAM = "jaxskills"
 BAD_INPUT = 2
 INTERRUPTED = 130
 
-# What the machine refuses, and the user can mend: said in one line. Other OSErrors are our bugs.
-_REFUSALS = {
-    getattr(errno, name)
-    for name in (
-        *("EACCES", "EPERM", "EROFS"),  # may not
-        *("ENOSPC", "EDQUOT"),  # disk full
-        *("ENOTDIR", "EISDIR", "ENAMETOOLONG"),  # not such a path
-    )
-    if hasattr(errno, name)
-}
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns its exit code: 0, 2 for bad input, 130 after Ctrl-C."""
     try:
-        _perform(*_parse(list(sys.argv[1:] if argv is None else argv)))
+        return _perform(*_parse(list(sys.argv[1:] if argv is None else argv)))
     except UserError as error:
         return _refuse(str(error))
     except BrokenPipeError:  # the reader of our output has seen enough, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:
-        if error.errno not in _REFUSALS:
+        return 0
+    except OSError as error:  # what the machine refuses about a file, its user can mend
+        if error.filename is None and error.errno not in _DISK_FULL:
             raise
-        return _refuse(f"cannot use '{error.filename}': {error.strerror}")
+        return _refuse(f"cannot use '{error.filename or 'the disk'}': {error.strerror}")
     except KeyboardInterrupt:
         print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return INTERRUPTED
     except SystemExit as end:  # tyro has printed the help
         return int(end.code or 0)
-    return 0
 
 
 def _refuse(message: str) -> int:
@@ -120,14 +111,16 @@ def _unboxed(box: str) -> str:
     return "; ".join(kept) or box
 
 
-def _perform(command: Any, settings: Any) -> None:
+def _perform(command: Any, settings: Any) -> int:
     commands = _commands()
-    if not getattr(command, "json", False):
-        print(commands.perform(command, settings).text)
-        return
-    with _only_on_stderr():
+    if getattr(command, "json", False):
+        with _only_on_stderr():
+            answer = commands.perform(command, settings)
+        print(json.dumps(answer.data, allow_nan=False), flush=True)
+    else:
         answer = commands.perform(command, settings)
-    print(json.dumps(answer.data, allow_nan=False))
+        print(answer.text, flush=True)
+    return INTERRUPTED if answer.interrupted else 0
 
 
 def _commands() -> ModuleType:

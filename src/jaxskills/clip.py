@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxskills import clip_bvh, clip_deepmimic, paths
+from jaxskills import clip_bvh, clip_deepmimic, keyframes, paths
 from jaxskills.clip_data import Clip, Skeleton, build
 from jaxskills.errors import UserError, unknown
 
@@ -123,5 +123,6 @@ _READERS = {
     ".txt": clip_deepmimic.read,
     ".json": clip_deepmimic.read,
     ".bvh": clip_bvh.read,
+    ".toml": keyframes.read,
     ".npz": _read_npz,
 }

@@ -40,13 +40,14 @@ def read(path: Path) -> Clip:
         raise UserError(f"clip '{path}' is empty")
     nodes = [node for node in bvh.nodes if not node.is_end_site()]
     names = tuple(node.name for node in nodes)
-    parents = tuple(names.index(n.parent.name) - 1 for n in nodes[1:])
+    parents = tuple(names.index(node.parent.name) - 1 for node in nodes[1:] if node.parent)
     offsets = np.array([node.offset for node in nodes[1:]])
     raw = Skeleton(parents, offsets)
     turn, axes = _turn(path, raw, names[1:], _tips(bvh, names))
     unit, unit_name = _unit(raw, names[1:])
     matrices = bvh.to_rotmat()[1]  # [F, 1+J, 3, 3]
-    local = Rotation.from_matrix(turn @ matrices @ turn.T).as_quat(scalar_first=True)
+    turned = Rotation.from_matrix((turn @ matrices @ turn.T).reshape(-1, 3, 3))
+    local = turned.as_quat(scalar_first=True).reshape(len(matrices), -1, 4)
     steps = bvh.frame_time
     peaks = np.abs(bvh.joint_angles).max(axis=(0, 2))
     return build(

@@ -112,7 +112,7 @@ def _parse(path: Path) -> tuple[np.ndarray, bool]:
     try:
         content = json.loads(text)
     except json.JSONDecodeError as error:
-        cut = error.pos >= len(text.rstrip()) or text.lstrip()[0] == "{" and text.rstrip()[-1] != "}"
+        cut = text.lstrip().startswith("{") and not text.rstrip().endswith("}")
         what = "ends early (truncated JSON)" if cut else "is not JSON"
         where = f"line {error.lineno}, column {error.colno}"
         raise UserError(f"clip '{path}' {what}: {error.msg}, {where}") from None

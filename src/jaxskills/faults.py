@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of misread clips: each detector tries the repair and accuses only if that is clearly better.
+"""Faults of misread clips: tries the repair, accuses if it is clearly better.
 
 Flipped hinges, left and right exchanged, wrong up axis, wrong length unit, wrong angle unit.
 """
 
 import dataclasses
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxskills import hinges, measures, repairs, roles
+from jaxskills.character import Character
 from jaxskills.clip_data import Clip
 from jaxskills.mapping import Mapping, targets
 from jaxskills.retarget import Transfer, transfer
-
-if TYPE_CHECKING:
-    from jaxskills.character import Character
 
 SEVERITIES = ("info", "warning", "fault")
 
@@ -44,7 +41,7 @@ class Finding:
     repaired: Clip | None = None  # the clip with this fault undone, where that can be done
 
 
-def find(character: "Character", clip: Clip, mapping: Mapping) -> list[Finding]:
+def find(character: Character, clip: Clip, mapping: Mapping) -> list[Finding]:
     """Returns the faults of a clip posed on a character, each with a repaired clip if possible.
 
     Later detectors work on the clip as repaired by the earlier ones, so one fault is named once.
@@ -85,7 +82,7 @@ def _angle_units(clip: Clip) -> list[Finding]:
     return []
 
 
-def _world(character: "Character", clip: Clip, mapping: Mapping) -> list[Finding]:
+def _world(character: Character, clip: Clip, mapping: Mapping) -> list[Finding]:
     """Wrong length unit or up axis: the root's height and the distance to the floor."""
     given = measures.world(character, clip, mapping)
     plausible = _HEIGHTS[0] < given.height < _HEIGHTS[1] and given.floor < _FLOOR
@@ -101,6 +98,7 @@ def _world(character: "Character", clip: Clip, mapping: Mapping) -> list[Finding
                 cost = seen.floor / 0.1 - seen.upright
                 if any(code == "up_axis" for code, _ in causes):
                     cost += max(measures.sidedness(character, repaired, mapping), 0.0)
+                    cost += 0.5 * causes[-1][1].endswith("only)")  # half a conversion is rarer
                 better.append((cost, len(better), causes, repaired, seen.height))
         if better:
             _, _, causes, repaired, height = min(better, key=lambda item: item[:2])
@@ -127,7 +125,7 @@ def _two_causes(clip: Clip) -> Iterator[tuple[tuple[tuple[str, str], ...], Clip]
             yield (*first, *second), repaired
 
 
-def _flips(character: "Character", clip: Clip, mapping: Mapping) -> list[Finding]:
+def _flips(character: Character, clip: Clip, mapping: Mapping) -> list[Finding]:
     """Hinges outside their range most of the time that would be inside with the sign flipped."""
     moved = transfer(character, clip, mapping)
     found = []
@@ -137,7 +135,7 @@ def _flips(character: "Character", clip: Clip, mapping: Mapping) -> list[Finding
     return found
 
 
-def _hinge_flips(character: "Character", moved: Transfer) -> dict[str, str]:
+def _hinge_flips(character: Character, moved: Transfer) -> dict[str, str]:
     sources = {to[0]: source for source, to in targets(moved.mapping).items() if len(to) == 1}
     accused = {}
     for limit in measures.limits(character, moved.qpos):
@@ -156,7 +154,7 @@ def _hinge_flips(character: "Character", moved: Transfer) -> dict[str, str]:
     return accused
 
 
-def _ball_knees(character: "Character", clip: Clip) -> dict[str, str]:
+def _ball_knees(character: Character, clip: Clip) -> dict[str, str]:
     """Knees without a range, told by the shin: it swings back about the axis to the left."""
     ball = {joint.name for joint in character.layout.joints if joint.kind == "ball"}
     mine = roles.of(tuple(joint.name for joint in character.layout.joints))
@@ -181,7 +179,7 @@ def _bends(joint: str) -> str:
     return f"{joint} {way}"
 
 
-def _named_sides(character: "Character", clip: Clip, mapping: Mapping) -> list[Finding]:
+def _named_sides(character: Character, clip: Clip, mapping: Mapping) -> list[Finding]:
     """Joints called left that lie on the right of the clip's own skeleton."""
     if clip.skeleton is None:
         return []
@@ -205,7 +203,7 @@ def _named_sides(character: "Character", clip: Clip, mapping: Mapping) -> list[F
     return [Finding("fault", "swapped_sides", text, repairs.rename_sides(clip))]
 
 
-def _sides(character: "Character", clip: Clip, mapping: Mapping) -> list[Finding]:
+def _sides(character: Character, clip: Clip, mapping: Mapping) -> list[Finding]:
     """Limbs whose motion fits the other side of the body."""
     given = measures.sidedness(character, clip, mapping)
     options = []

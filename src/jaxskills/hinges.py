@@ -17,7 +17,8 @@ def angles(rotation: Rotation, axes: np.ndarray, middles: np.ndarray) -> np.ndar
 
     Args:
       rotation: F rotations.
-      axes: [n,3] hinge axes at zero angles, outermost first, n = 1, 2 or 3, neighbours not parallel.
+      axes: [n,3] hinge axes at zero angles, outermost first, n = 1, 2 or 3; no two neighbours may
+        be parallel.
       middles: [n] rad, middle of each hinge's range: whole turns are chosen to lie near it.
     """
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
@@ -69,7 +70,7 @@ def _solutions(
 
 
 def _follow(both: np.ndarray, start: int) -> np.ndarray:
-    """Returns the run [F,n] that begins with solution `start` and moves least from frame to frame."""
+    """Returns the run [F,n] that begins with solution `start` and moves least at each frame."""
     run = [both[start, 0]]
     for options in both[:, 1:].swapaxes(0, 1):
         near = options + _TURN * np.round((run[-1] - options) / _TURN)

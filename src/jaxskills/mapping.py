@@ -3,17 +3,14 @@
 
 import dataclasses
 from collections.abc import Mapping as Table
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxskills import clip_deepmimic, roles
+from jaxskills.character import Character
 from jaxskills.clip_data import Clip, Skeleton
-
-if TYPE_CHECKING:
-    from jaxskills.character import Character
 
 # Zero poses that point a bone this much apart get a rest rotation; less is a matter of style.
 _REST_DEGREES = 15.0
@@ -127,7 +124,7 @@ def targets(mapping: Mapping) -> dict[str, tuple[str, ...]]:
     }
 
 
-def guess_mapping(character: "Character", clip: Clip) -> Mapping:
+def guess_mapping(character: Character, clip: Clip) -> Mapping:
     """Returns a preset that fits, else a mapping by body part with rest rotations from the bones.
 
     Joints are matched by what their names say (`roles`); limbs whose zero poses point elsewhere
@@ -162,7 +159,7 @@ def _renamed(preset: Mapping, names: dict[str, str]) -> Mapping:
 
 
 def _rest(
-    character: "Character", clip: Clip, mine: dict[str, tuple[str, ...]], found: dict[str, str]
+    character: Character, clip: Clip, mine: dict[str, tuple[str, ...]], found: dict[str, str]
 ) -> dict[str, tuple[float, float, float]]:
     """Returns the rest rotations that make the character's limbs point as at the clip's zero."""
     assert clip.skeleton is not None
@@ -185,7 +182,7 @@ def _rest(
     return rest
 
 
-def joint_positions(character: "Character") -> dict[str, np.ndarray]:
+def joint_positions(character: Character) -> dict[str, np.ndarray]:
     """Returns where each joint is at the zero pose [3] in m, in the world with x forward."""
     data = mujoco.MjData(character.model)
     mujoco.mj_kinematics(character.model, data)
@@ -194,7 +191,7 @@ def joint_positions(character: "Character") -> dict[str, np.ndarray]:
     return {name: face.apply(data.xanchor[index]) for index, name in enumerate(names)}
 
 
-def facing(character: "Character") -> Rotation:
+def facing(character: Character) -> Rotation:
     """Returns the turn about z that takes the character's `forward` to x."""
     x, y, _ = character.forward
     return Rotation.from_euler("z", -np.arctan2(y, x))

@@ -2,7 +2,6 @@
 """Numbers that tell a sound motion from a misread one, once it is posed on a character."""
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -10,11 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxskills import mapping as mappings
 from jaxskills import posed, retarget, roles
+from jaxskills.character import Character
 from jaxskills.clip_data import Clip
 from jaxskills.mapping import Mapping
-
-if TYPE_CHECKING:
-    from jaxskills.character import Character
 
 _FRAMES = 60  # at most so many frames are looked at when whole hypotheses are compared
 _SLACK = 0.05  # rad, overshoot of a joint's range that nobody sees
@@ -46,17 +43,17 @@ class World:
     upright: float  # mean of the root's up axis along z
 
 
-def standing_height(character: "Character") -> float:
+def standing_height(character: Character) -> float:
     """Returns the root's height in m with straight legs and soles on the floor."""
     model = character.model
     lowest = posed.look(model, model.qpos0[None]).lowest[0]
     return float(model.qpos0[2] - lowest)
 
 
-def world(character: "Character", clip: Clip, mapping: Mapping) -> World:
+def world(character: Character, clip: Clip, mapping: Mapping) -> World:
     """Returns how the clip stands in the world, without any automatic lift."""
     mapping = dataclasses.replace(mapping, lift=mapping.lift or 0.0)
-    qpos = retarget.retarget(character, thinned(clip, _FRAMES // 3), mapping)
+    qpos = retarget.retarget(character, thinned(clip, _FRAMES // 4), mapping)
     view = posed.look(character.model, qpos)
     return World(
         floor=float(np.abs(view.lowest).mean()),
@@ -65,7 +62,7 @@ def world(character: "Character", clip: Clip, mapping: Mapping) -> World:
     )
 
 
-def limits(character: "Character", qpos: np.ndarray) -> list[Limit]:
+def limits(character: Character, qpos: np.ndarray) -> list[Limit]:
     """Returns every limited joint axis: hinge ranges of the model, ball ranges of the toml."""
     model, found = character.model, []
     for index in range(model.njnt):
@@ -82,11 +79,11 @@ def limits(character: "Character", qpos: np.ndarray) -> list[Limit]:
     return found
 
 
-def sidedness(character: "Character", clip: Clip, mapping: Mapping) -> float:
+def sidedness(character: Character, clip: Clip, mapping: Mapping) -> float:
     """Returns how unlikely the limbs are, the sum of four signs that left and right are exchanged.
 
-    Limbs run into each other or the trunk; ball joints leave their ranges, which are not the same on
-    both sides; feet stand crossed; thighs and toes turn inwards. The terms are scaled to be about 1
+    Limbs run into each other or the trunk; ball joints leave their ranges, which differ between
+    the sides; feet stand crossed; thighs and toes turn inwards. The terms are scaled to be about 1
     for a walk with its sides exchanged. Only differences between two readings of one clip count.
     """
     model = character.model

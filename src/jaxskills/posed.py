@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses looked at with MuJoCo on the host: where bodies are, how they meet the floor and each other."""
+"""Poses looked at with MuJoCo on the host: where bodies are, what touches what."""
 
 import dataclasses
 import itertools

@@ -60,8 +60,9 @@ def turn_axes(clip: Clip, axes: str, what: str = "everything") -> Clip:
         read = Rotation.from_quat(clip.root_rot, scalar_first=True)
         changed["root_rot"] = (turn * read * inner).as_quat(scalar_first=True)
     if what == "everything":
-        read = Rotation.from_quat(clip.rotations, scalar_first=True)
-        changed["rotations"] = (turn * read * turn.inv()).as_quat(scalar_first=True)
+        read = Rotation.from_quat(clip.rotations.reshape(-1, 4), scalar_first=True)
+        turned = (turn * read * turn.inv()).as_quat(scalar_first=True)
+        changed["rotations"] = turned.reshape(clip.rotations.shape)
     return dataclasses.replace(clip, **changed)
 
 
@@ -103,5 +104,3 @@ def flip(clip: Clip, joint: str) -> Clip:
     rotations = clip.rotations.copy()
     rotations[:, clip.joints.index(joint), 1:] *= -1.0
     return dataclasses.replace(clip, rotations=rotations)
-
-

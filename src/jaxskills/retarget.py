@@ -7,19 +7,16 @@ either side. What a hinge cannot take is measured, and made up by the next joint
 """
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxskills import hinges, posed, roles
+from jaxskills.character import Character
 from jaxskills.clip_data import Clip
 from jaxskills.errors import UserError, unknown
 from jaxskills.mapping import Mapping, facing, guess_mapping, joint_positions, targets
-
-if TYPE_CHECKING:
-    from jaxskills.character import Character
 
 __all__ = ["Mapping", "Transfer", "guess_mapping", "retarget", "transfer"]
 
@@ -38,7 +35,7 @@ class Transfer:
     lost: dict[str, np.ndarray]  # clip joint -> [F] rad its hinges could not take
 
 
-def retarget(character: "Character", clip: Clip, mapping: Mapping | None = None) -> np.ndarray:
+def retarget(character: Character, clip: Clip, mapping: Mapping | None = None) -> np.ndarray:
     """Returns the clip's poses on the character, `qpos [F,nq]`, float64.
 
     Ball joints get the rotation, a tuple of them equal shares; a hinge gets the twist about its
@@ -56,7 +53,7 @@ def retarget(character: "Character", clip: Clip, mapping: Mapping | None = None)
     return transfer(character, clip, mapping).qpos
 
 
-def transfer(character: "Character", clip: Clip, mapping: Mapping | None = None) -> Transfer:
+def transfer(character: Character, clip: Clip, mapping: Mapping | None = None) -> Transfer:
     """Returns `retarget`'s poses together with scale, lift and what hinges lost."""
     mapping = guess_mapping(character, clip) if mapping is None else mapping
     _check(character, clip, mapping)
@@ -72,7 +69,7 @@ def transfer(character: "Character", clip: Clip, mapping: Mapping | None = None)
     return Transfer(qpos, mapping, scale, lift, lost)
 
 
-def _pose(character: "Character", clip: Clip, mapping: Mapping, qpos: np.ndarray) -> dict:
+def _pose(character: Character, clip: Clip, mapping: Mapping, qpos: np.ndarray) -> dict:
     """Writes the rotations of all joints into `qpos`; returns what hinges lost.
 
     All rotations are written in axes that are the world's at the zero pose: `turned[b]` takes body
@@ -90,7 +87,8 @@ def _pose(character: "Character", clip: Clip, mapping: Mapping, qpos: np.ndarray
     for body in range(1, model.nbody):
         parent = int(model.body_parentid[body])
         turned[body], rest[body], source_of[body] = turned[parent], rest[parent], source_of[parent]
-        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+        first = model.body_jntadr[body]
+        for joint in range(first, first + model.body_jntnum[body]):
             name = model.joint(joint).name
             if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
                 rest[body] = facing(character) * _rest_of(mapping, "root")
@@ -115,7 +113,7 @@ def _pose(character: "Character", clip: Clip, mapping: Mapping, qpos: np.ndarray
 
 
 def _orientations(clip: Clip) -> dict[str, Rotation]:
-    """Returns world orientations from the zero pose: of the root, of all joints if parents are known."""
+    """Returns world orientations: of the root, and of all joints if the parents are known."""
     world = {"root": Rotation.from_quat(clip.root_rot, scalar_first=True)}
     if clip.skeleton is not None:
         for joint in _parents_first(clip.skeleton.parents):
@@ -180,7 +178,7 @@ def _quat(rotation: Rotation) -> np.ndarray:
     return quat if quat[0, 0] >= 0 else -quat
 
 
-def _scale(character: "Character", clip: Clip) -> float:
+def _scale(character: Character, clip: Clip) -> float:
     """Returns the character's leg length over the clip's, 1 if either is unknown."""
     theirs = roles.leg_length(clip.joints, clip.skeleton) if clip.skeleton else None
     at = joint_positions(character)
@@ -192,7 +190,7 @@ def _scale(character: "Character", clip: Clip) -> float:
     return float(length / theirs)
 
 
-def _check(character: "Character", clip: Clip, mapping: Mapping) -> None:
+def _check(character: Character, clip: Clip, mapping: Mapping) -> None:
     allowed = {joint.name: joint for joint in character.layout.joints if joint.kind != "free"}
     used: dict[str, str] = {}
     if not mapping.joints:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which part of the body a joint is, told from its name: `LeftUpLeg`, `thigh.L`, `left_hip`.
 
-A role is `trunk`, `neck`, `head`, or `left_`/`right_` with `hip`, `knee`, `ankle`, `toe`, `clavicle`,
-`shoulder`, `elbow`, `wrist`. Several joints may share one (spines, the three hinges of a hip).
+A role is `trunk`, `neck`, `head`, or `left_`/`right_` with `hip`, `knee`, `ankle`, `toe`,
+`clavicle`, `shoulder`, `elbow`, `wrist`. Several joints may share one: spines, hinges of a hip.
 """
 
 import re
@@ -28,7 +28,8 @@ _LIMBS = {
     "wrist": "wrist hand armwry armwrx",
 }
 _MIDDLE = {
-    "trunk": "spine chest torso back lowerback upperback thorax abdomen waist backbkz backbky backbkx",
+    "trunk": "spine chest torso back lowerback upperback thorax abdomen waist"
+    " backbkz backbky backbkx",
     "neck": "neck neckry",
     "head": "head",
 }

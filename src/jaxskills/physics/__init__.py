@@ -6,11 +6,14 @@
   warp  MuJoCo Warp: the default on NVIDIA
 """
 
-import jax
+import importlib.util
+import os
 
+import jax
+from jax._src import xla_bridge  # nothing public tells whether jax has used a device already
 
 from jaxskills.errors import UserError, unknown
-from jaxskills.physics import cpu, mjx
+from jaxskills.physics import cpu
 from jaxskills.physics.base import Physics, SimState
 from jaxskills.physics.cpu import usable_cores
 
@@ -25,6 +28,9 @@ __all__ = [
 ]
 
 BACKENDS = ("cpu", "mjx", "warp")
+
+POOL = 8
+"""Threads that XLA's CPU pool needs for MJX."""
 
 
 def make(backend: str, substeps: int, *, num_envs: int, threads: int | None = None) -> Physics:
@@ -42,29 +48,41 @@ def make(backend: str, substeps: int, *, num_envs: int, threads: int | None = No
     for name, value in (("substeps", substeps), ("num_envs", num_envs), ("threads", threads)):
         if value is not None and value < 1:
             raise UserError(f"physics {name} is {value}: give at least 1")
+    if backend not in BACKENDS:
+        raise unknown("backend", backend, BACKENDS)
     if backend == "cpu":
         return cpu.make(substeps, threads)
-    if backend == "warp":
-        return mjx.make("warp", substeps, num_envs)
-    if backend == "mjx":
-        if not configure_cpu() and jax.default_backend() == "cpu":
-            raise UserError(
-                "backend 'mjx' hangs on a CPU where jax was used with asynchronous dispatch: call"
-                " jaxskills.physics.configure_cpu() first, or set JAX_CPU_ENABLE_ASYNC_DISPATCH=0"
-            )
-        return mjx.make("jax", substeps, num_envs)
-    raise unknown("backend", backend, BACKENDS)
+    if backend == "warp" and not _warp_installed():
+        raise UserError("backend 'warp' needs warp-lang: run pip install 'mujoco-mjx[warp]'")
+    if backend == "mjx" and not configure_cpu() and jax.default_backend() == "cpu":
+        raise UserError(
+            "backend 'mjx' can wait for ever on a CPU of few cores: call jaxskills.physics."
+            f"configure_cpu() before jax is first used, or set the variable NPROC={POOL}"
+        )
+    from jaxskills.physics import mjx  # slow to import, and not needed by the other backend
+
+    return mjx.make("warp" if backend == "warp" else "jax", substeps, num_envs)
 
 
 def configure_cpu() -> bool:
-    """Turns asynchronous dispatch on the CPU off, if jax has not used a device yet.
+    """Makes jax on the CPU fit for MJX and Python callbacks, if it has not used a device yet.
 
-    With it, MJX under vmap waits for ever on a machine with few cores (jax 0.10.2). The other
-    backends run either way. Returns whether it is off.
+    jaxlib's batched Cholesky factorisation runs on a thread of XLA's pool and waits there for
+    tasks of the same pool: on two cores, two of them wait for each other for ever (jaxlib 0.10.2).
+    So the pool gets `POOL` threads (variable NPROC). Asynchronous dispatch, which takes another
+    of them, is turned off. Returns whether the pool is large enough.
     """
-    if not False:
+    pool = _pool_size()
+    if not xla_bridge.backends_are_initialized():
         jax.config.update("jax_cpu_enable_async_dispatch", False)
-    return True
+        os.environ["NPROC"] = str(max(pool, POOL))
+    return _pool_size() >= POOL
+
+
+def _pool_size() -> int:
+    """Returns how many threads XLA's CPU pool has, or would have if it started now."""
+    named = os.environ.get("NPROC", "")
+    return int(named) if named.isdigit() and int(named) > 0 else usable_cores()
 
 
 def default_backend() -> str:
@@ -72,4 +90,8 @@ def default_backend() -> str:
     platform = jax.default_backend()
     if platform == "cpu":
         return "cpu"
-    return "warp" if platform in ("cuda", "gpu") and mjx.warp_installed() else "mjx"
+    return "warp" if platform in ("gpu", "cuda") and _warp_installed() else "mjx"
+
+
+def _warp_installed() -> bool:
+    return importlib.util.find_spec("warp") is not None

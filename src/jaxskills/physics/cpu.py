@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 
-from jaxskills.physics import ffi
+from jaxskills.physics import ffi, quiet
 from jaxskills.physics.base import Physics, SimState, admit, check, settle, start
 
 TARGET = "jaxskills_mujoco_step"
@@ -29,7 +29,7 @@ TARGET = "jaxskills_mujoco_step"
 CALLBACK_VARIABLE = "JAXSKILLS_CPU_CALLBACK"
 """Environment variable: set to 1, physics goes through `jax.pure_callback` (slower)."""
 
-KEPT = 32
+KEPT = 16
 """Sets of models kept in memory at most; the least recently used one goes first."""
 
 
@@ -81,6 +81,7 @@ def load(models: Sequence[mujoco.MjModel], threads: int) -> CpuModel:
       UserError: no model, models of unequal sizes, or state that a `SimState` does not carry.
     """
     check(models)
+    quiet.silence()
     hashed = hashlib.sha256(str(threads).encode())
     for model in models:
         content = np.empty(mujoco.mj_sizeModel(model), np.uint8)

@@ -5,7 +5,9 @@ Both carry the same small state as the cpu backend: what else MJX keeps in its D
 coordinates, velocities and warm start, so it is rebuilt from a template at each control step.
 """
 
+import contextlib
 import functools
+import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,10 +16,13 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import batch, mjx
+from mujoco import batch
 
 from jaxskills.errors import UserError
 from jaxskills.physics.base import Physics, SimState, admit, check, settle, start
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints where warp-lang is missing
+    from mujoco import mjx
 
 MARGIN = 2
 """Contact and constraint capacity for Warp, as a multiple of what a C rollout reached."""

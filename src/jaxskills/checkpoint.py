@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints of a run: the whole `TrainState`, written beside the last one and then swapped in.
+
+A run folder holds `config.json`, `metrics.jsonl`, TensorBoard events and `checkpoints/SAMPLES/`.
+"""
+
+import dataclasses
+import json
+import shutil
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+
+from jaxskills.errors import UserError
+from jaxskills.trainer import TrainConfig, Trainer, TrainState
+
+_KEPT = 2  # checkpoints; a damaged newest one does not cost the run
+
+
+def save(run: Path, state: TrainState, samples: int) -> Path:
+    """Writes `RUN/checkpoints/SAMPLES` and removes older ones.
+
+    It is complete or absent: a full disk or a kill leaves what was saved before.
+
+    Raises:
+      OSError: the disk is full or the folder cannot be written.
+    """
+    folder = (run / "checkpoints").absolute()
+    path = folder / f"{samples:012d}"
+    if not path.exists():
+        with ocp.StandardCheckpointer() as writer:
+            writer.save(path, state)
+    for old in existing(run)[:-_KEPT]:
+        shutil.rmtree(folder / f"{old:012d}", ignore_errors=True)
+    return path
+
+
+def existing(run: Path) -> list[int]:
+    """Returns the sample counts of the run's checkpoints, ascending."""
+    return sorted(
+        int(path.name) for path in (run / "checkpoints").glob("[0-9]" * 12) if path.is_dir()
+    )
+
+
+def restore(run: Path, trainer: Trainer) -> TrainState:
+    """Returns the newest state of a run.
+
+    Raises:
+      UserError: there is none, or it is damaged or of another configuration.
+    """
+    found = existing(run)
+    if not found:
+        raise UserError(f"run '{run}' holds no checkpoint yet: train it for longer")
+    path = (run / "checkpoints" / f"{found[-1]:012d}").absolute()
+    shapes = jax.eval_shape(trainer.init, jax.random.key(0))
+    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    target = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), shapes
+    )
+    try:
+        with ocp.StandardCheckpointer() as reader:
+            return reader.restore(path, target)
+    except Exception as error:  # orbax raises many kinds for missing, cut off or reshaped arrays
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        remedy = f"remove it to fall back on {found[-2]} samples" if len(found) > 1 else "train anew"
+        raise UserError(
+            f"checkpoint '{path}' is damaged or of other settings ({reason}): {remedy}"
+        ) from None
+
+
+def write_config(run: Path, config: TrainConfig) -> None:
+    """Writes `RUN/config.json`."""
+    text = json.dumps(dataclasses.asdict(config), indent=2)
+    (run / "config.json").write_text(text + "\n")
+
+
+def read_config(run: Path) -> TrainConfig:
+    """Returns the configuration of a run.
+
+    Raises:
+      UserError: no such run, or its config.json is damaged or of another version.
+    """
+    path = run / "config.json"
+    if not path.is_file():
+        raise UserError(f"'{run}' is not a run: it has no config.json")
+    try:
+        return _build(TrainConfig, json.loads(path.read_text()))
+    except (ValueError, TypeError, KeyError) as error:
+        raise UserError(f"'{path}' is damaged: {' '.join(str(error).split())}") from None
+
+
+def _build(kind: Any, value: Any) -> Any:
+    """Returns JSON data as the annotated type: dataclasses, tuples, mappings, unions, plain."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        hints = typing.get_type_hints(kind)
+        unknown = set(value) - set(hints)
+        if unknown:
+            raise ValueError(f"unknown entry {', '.join(sorted(unknown))}")
+        return kind(**{name: _build(hints[name], item) for name, item in value.items()})
+    if origin in (typing.Union, types.UnionType):
+        plain = [option for option in arguments if typing.get_origin(option) is not tuple]
+        return tuple(value) if isinstance(value, list) else (value if plain else None)
+    if origin is tuple:
+        return tuple(value)
+    return value

@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`jit` with what suits the default device."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+# On a CPU the older loop emitter compiles the kinematics four times as fast, and they run faster.
+_CPU_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+
+
+def jit(function: Callable[..., Any], *, donate: bool = False) -> Any:
+    """Returns the jitted function; with `donate` its first argument's buffers are reused."""
+    options = _CPU_OPTIONS if jax.default_backend() == "cpu" else None
+    return jax.jit(function, donate_argnums=(0,) if donate else (), compiler_options=options)

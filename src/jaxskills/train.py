@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training loop that a person starts: updates, evaluations, metrics, checkpoints, the end.
+
+All learning is in `trainer.update`; what happens here never changes the state, so a run's bits do
+not depend on how often it is looked at, saved or evaluated.
+"""
+
+import json
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from tensorboardX import SummaryWriter
+
+from jaxskills import checkpoint, evaluate, trainer
+from jaxskills.compilation import jit
+from jaxskills.errors import UserError
+from jaxskills.motion import CONTROL_DT
+from jaxskills.trainer import TrainConfig, Trainer, TrainState
+
+SAVE_SECONDS = 120.0  # between checkpoints
+_LOG_UPDATES = 5  # between lines of metrics.jsonl
+_EVALUATION_SHARE = 0.1  # of the time, at most
+_PROMISING_SECONDS = 2.0  # of survival while exploring, before an evaluation is worth its time
+
+Report = Callable[[Mapping[str, Any]], None]
+
+
+def train(
+    config: TrainConfig, run: Path, report: Report, resume: bool = False
+) -> tuple[Trainer, TrainState, dict[str, Any]]:
+    """Trains until the skill is learnt, the samples are used up, or Ctrl-C.
+
+    Args:
+      config: all settings; on `resume` those that the run began with, or changed by the user.
+      run: folder to write to.
+      report: called with every line of metrics.
+      resume: go on from the newest checkpoint.
+
+    Returns:
+      The trainer, the last state, which is saved, and the last metrics; their entry `why` is
+      "learnt", "samples used up" or "interrupted".
+
+    Raises:
+      UserError: bad settings, or a run folder that is in use or cannot be resumed.
+    """
+    made = trainer.make(config)
+    if resume:
+        state = checkpoint.restore(run, made)
+        history = _rewind(run, samples_of(config, state))
+    else:
+        _claim(run)
+        state, history = jit(made.init)(jax.random.key(config.seed)), []
+    checkpoint.write_config(run, config)
+    with _stop_signal() as stopped:
+        state, last = _loop(made, run, state, history, report, stopped)
+    return made, state, last
+
+
+def samples_of(config: TrainConfig, state: TrainState) -> int:
+    """Returns how many transitions a state has learnt from."""
+    return int(state.updates) * config.envs * config.horizon
+
+
+def _loop(
+    made: Trainer,
+    run: Path,
+    state: TrainState,
+    history: list[dict[str, Any]],
+    report: Report,
+    stopped: Callable[[], bool],
+) -> tuple[TrainState, dict[str, Any]]:
+    config = made.config
+    update = jit(made.update, donate=True)
+    judge = _Judge(made)
+    before = history[-1]["wall_s"] if history else 0.0
+    begin = saved = time.monotonic()
+    samples, sums, why = samples_of(config, state), [], ""
+    last: dict[str, Any] = {"samples": samples, "wall_s": before, "survival_s": 0.0}
+    with (run / "metrics.jsonl").open("a") as lines, SummaryWriter(str(run)) as board:
+        while not why:
+            if samples >= config.samples:
+                why = "samples used up"
+            elif stopped():
+                why = "interrupted"
+            else:
+                state, metrics = update(state)
+                samples += config.envs * config.horizon
+                sums.append(jax.device_get(metrics))
+            if sums and (len(sums) == _LOG_UPDATES or why):
+                last = line(made, sums, samples, before + time.monotonic() - begin)
+                sums = []
+                last |= judge(state, last["survival_s"])
+                if judge.learnt:
+                    why = "learnt"
+                lines.write(json.dumps(last) + "\n")
+                lines.flush()
+                _to_board(board, last)
+                report(last)
+            if why or time.monotonic() - saved > SAVE_SECONDS:
+                checkpoint.save(run, state, samples)
+                saved = time.monotonic()
+    return state, last | {"why": why}
+
+
+class _Judge:
+    """Evaluates now and then, and says when the skill is learnt.
+
+    A skill counts as learnt when two evaluations with different starts both pass: the best of many
+    tries at one would flatter it.
+    """
+
+    def __init__(self, made: Trainer):
+        self.learnt = False
+        self._enabled = made.config.stop_when_learnt
+        self._trace = jit(evaluate.make(made, evaluate.EvaluateConfig()))
+        self._seed = 0
+        self._due = 0.0
+
+    def __call__(self, state: TrainState, survival: float) -> dict[str, float]:
+        begin = time.monotonic()
+        if begin < self._due or survival < _PROMISING_SECONDS or not self._enabled:
+            return {}
+        found = self._evaluate(state)
+        if found["success_rate"] >= evaluate.SUCCESS_RATE:
+            again = self._evaluate(state)
+            self.learnt = again["success_rate"] >= evaluate.SUCCESS_RATE
+            found = {name: (found[name] + again[name]) / 2 for name in found}
+        now = time.monotonic()
+        self._due = now + (now - begin) / _EVALUATION_SHARE
+        return {name: found[name] for name in ("success_rate", "seconds_mean", "inside_seconds_mean")}
+
+    def _evaluate(self, state: TrainState) -> dict[str, float]:
+        self._seed += 1
+        return evaluate.summary(self._trace(state, jax.random.key(self._seed)))
+
+
+def line(
+    made: Trainer, metrics: list[dict[str, np.ndarray]], samples: int, wall: float
+) -> dict[str, Any]:
+    """Returns one line of metrics.jsonl: sums and means over a few updates."""
+    total = {name: sum(m[name] for m in metrics) for name in metrics[0]}
+    count = len(metrics)
+    endings = np.asarray(total["endings"])
+    ended = max(float(endings.sum()), 1.0)
+    cause, place = np.unravel_index(endings.argmax(), endings.shape)
+    shares = {
+        f"ended/{name}": round(float(n) / ended, 4)
+        for name, n in zip(made.env.endings, endings.sum(1), strict=True)
+        if n
+    }
+    return {
+        "samples": samples,
+        "wall_s": round(wall, 2),
+        "survival_s": float(total["steps"] / max(total["episodes"], 1.0) * CONTROL_DT),
+        "reward": float(total["reward"] / count),
+        "kl": float(total["kl"] / count),
+        "clipped": float(total["clipped"] / count),
+        "value_loss": float(total["value_loss"] / count),
+        "diverged": int(total["diverged"]),
+        "worst_bound": made.env.endings[cause],
+        "worst_phase": round((float(place) + 0.5) / endings.shape[1], 3),
+        **shares,
+    }
+
+
+def _to_board(board: SummaryWriter, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        if isinstance(value, int | float) and name != "samples":
+            board.add_scalar(name, value, values["samples"])
+
+
+def _claim(run: Path) -> None:
+    """Makes the run folder, which must not hold anything yet."""
+    if run.exists() and (not run.is_dir() or any(run.iterdir())):
+        raise UserError(f"'{run}' exists: give --resume to go on with it, or another --out")
+    run.mkdir(parents=True, exist_ok=True)
+
+
+def _rewind(run: Path, samples: int) -> list[dict[str, Any]]:
+    """Returns the metrics up to the checkpoint and drops the lines after it from the file."""
+    path = run / "metrics.jsonl"
+    lines = path.read_text().splitlines() if path.is_file() else []
+    kept = []
+    for text in lines:
+        try:
+            row = json.loads(text)
+        except json.JSONDecodeError:
+            break  # the line that a kill cut off
+        if row["samples"] > samples:
+            break
+        kept.append(row)
+    if len(kept) < len(lines):
+        shutil.copy(path, path.with_suffix(".jsonl.bak"))
+        path.write_text("".join(json.dumps(row) + "\n" for row in kept))
+    return kept
+
+
+@contextmanager
+def _stop_signal() -> Iterator[Callable[[], bool]]:
+    """Yields whether Ctrl-C was pressed; a second press interrupts at once."""
+    pressed = False
+
+    def press(number: int, frame: Any) -> None:
+        nonlocal pressed
+        if pressed:
+            raise KeyboardInterrupt
+        pressed = True
+
+    try:
+        previous = signal.signal(signal.SIGINT, press)
+    except ValueError:  # not the main thread: a notebook's job, say
+        yield lambda: False
+        return
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, previous)

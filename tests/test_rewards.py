@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The imitation reward: 1 on the reference, and numbers worked out by hand."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+
+from jaxskills.character import Character
+from jaxskills.env import rewards
+from jaxskills.kinematics import Bodies
+
+
+@pytest.fixture(scope="module")
+def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
+    return tiny.load_character(tmp_path_factory.mktemp("character"))
+
+
+def _bodies(com) -> Bodies:
+    none = jnp.zeros((4, 3))
+    return Bodies(none, jnp.zeros((4, 3, 3)), none, none, jnp.array(com), jnp.zeros(3))
+
+
+def _reward(
+    who: Character, offset=(), velocity=(), effectors=((0.0, 0.0, 0.0),) * 3, com=(0.0, 0.0, 0.0)
+) -> float:
+    """Returns the reward for errors given as (index, value) pairs and plain vectors."""
+    rows = np.zeros((2, who.layout.nv))
+    for row, pairs in zip(rows, (offset, velocity), strict=True):
+        for index, value in pairs:
+            row[index] = value
+    here = jnp.ones((3, 3))
+    return float(
+        rewards.imitation(
+            rewards.imitation_weights(who),
+            jnp.asarray(rows[0]),
+            jnp.asarray(rows[1]),
+            (here, here + jnp.array(effectors)),
+            _bodies((1.0, 2.0, 3.0)),
+            _bodies(np.add((1.0, 2.0, 3.0), com)),
+        )
+    )
+
+
+def test_weights_are_the_joints_shares(who: Character):
+    """Weights 1 (root), 1 (spine), 0.5 and 0.5 (hips) of 3 in all; a joint's axes share one."""
+    weights = rewards.imitation_weights(who)
+    np.testing.assert_allclose(weights.root_weight, 1 / 3)
+    np.testing.assert_allclose(weights.dof_weight, [1 / 3, 1 / 3, 1 / 3, 1 / 6, 1 / 6], rtol=1e-6)
+
+
+def test_the_reference_is_worth_one(who: Character):
+    assert _reward(who) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_one_by_hand(who: Character):
+    """Root 0.3 rad, spine (0.3, 0, 0.4) rad, left hip 0.6 rad: (0.09 + 0.25) / 3 + 0.36 / 6 =
+    0.17333; hips 1 and 2 rad/s: (1 + 4) / 6; one effector 0.1 and one 0.2 m off: 0.05 / 3; the
+    centre of mass 0.1 m: 0.01."""
+    found = _reward(
+        who,
+        offset=[(4, 0.3), (6, 0.3), (8, 0.4), (9, 0.6)],
+        velocity=[(9, 1.0), (10, -2.0)],
+        effectors=((0.1, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, -0.2)),
+        com=(0.0, 0.1, 0.0),
+    )
+    # 0.65 e^-0.34667 + 0.1 e^-0.083333 + 0.15 e^-0.66667 + 0.1 e^-0.1
+    assert found == pytest.approx(0.45958 + 0.09200 + 0.07701 + 0.09048, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "errors"),
+    [
+        ("pose", {"offset": [(3, 30.0)]}),
+        ("velocity", {"velocity": [(5, 300.0)]}),
+        ("end_effectors", {"effectors": ((9.0, 0.0, 0.0),) * 3}),
+        ("com", {"com": (9.0, 0.0, 0.0)}),
+    ],
+)
+def test_each_term_alone_lost_costs_its_weight(who: Character, name: str, errors: dict):
+    assert _reward(who, **errors) == pytest.approx(1.0 - rewards.TERMS[name], abs=1e-5)
+
+
+def test_where_the_root_is_costs_nothing_by_itself(who: Character):
+    """The position of the root counts through the centre of mass only."""
+    assert _reward(who, offset=[(0, 5.0), (2, 1.0)], velocity=[(1, 3.0)]) == pytest.approx(1.0)
+
+
+def test_terms_are_deepmimics():
+    assert rewards.TERMS == {"pose": 0.65, "velocity": 0.1, "end_effectors": 0.15, "com": 0.1}
+    assert math.isclose(sum(rewards.TERMS.values()), 1.0)

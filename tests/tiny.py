@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A walker of four bodies and its walk: every kind of joint, and quick to compile."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxskills import character, clip, clip_data, motion
+from jaxskills import physics as physics_lib
+from jaxskills.character import Character
+from jaxskills.env import bounds, core
+from jaxskills.learn.networks import NetworkConfig
+from jaxskills.learn.ppo import PPOConfig
+from jaxskills.motion import Motion
+from jaxskills.physics import Physics
+from jaxskills.trainer import TrainConfig
+
+_XML = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <body name="pelvis" pos="0 0 0.5">
+      <freejoint name="root"/>
+      <geom type="box" size="0.05 0.12 0.05" mass="3"/>
+      <body name="torso" pos="0 0 0.08">
+        <joint name="spine" type="ball"/>
+        <geom type="capsule" fromto="0 0 0.05 0 0 0.2" size="0.06" mass="2"/>
+      </body>
+      <body name="left_leg" pos="0 0.12 0">
+        <joint name="left_hip" type="hinge" axis="0 -1 0"/>
+        <geom type="capsule" fromto="0 0 -0.08 0 0 -0.4" size="0.03" mass="1" contype="0"
+              conaffinity="0"/>
+        <geom type="box" pos="0.02 0 -0.48" size="0.12 0.05 0.02" mass="0.5"/>
+      </body>
+      <body name="right_leg" pos="0 -0.12 0">
+        <joint name="right_hip" type="hinge" axis="0 -1 0"/>
+        <geom type="capsule" fromto="0 0 -0.08 0 0 -0.4" size="0.03" mass="1" contype="0"
+              conaffinity="0"/>
+        <geom type="box" pos="0.02 0 -0.48" size="0.12 0.05 0.02" mass="0.5"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+_TOML = """
+end_effectors = ["torso", "left_leg", "right_leg"]
+ground = ["left_leg", "right_leg"]
+[gains]
+spine = {kp = 60.0, kd = 6.0, torque = 30.0, weight = 1.0}
+left_hip = {kp = 80.0, kd = 8.0, torque = 40.0, weight = 0.5}
+right_hip = {kp = 80.0, kd = 8.0, torque = 40.0, weight = 0.5}
+"""
+
+SPINE = slice(7, 11)  # in qpos
+LEFT_HIP, RIGHT_HIP = 11, 12
+
+
+def write_character(folder: Path) -> Path:
+    """Writes `walker.xml` and `walker.toml`; returns the path of the first."""
+    path = folder / "walker.xml"
+    path.write_text(_XML)
+    path.with_suffix(".toml").write_text(_TOML)
+    return path
+
+
+def load_character(folder: Path) -> Character:
+    """Returns the walker."""
+    return character.load(str(write_character(folder)))
+
+
+def standing(frames: int = 7) -> np.ndarray:
+    """Returns the same upright pose `[frames, nq]` again and again."""
+    qpos = np.zeros((frames, 13))
+    qpos[:, 2], qpos[:, 3], qpos[:, 7] = 0.5, 1.0, 1.0
+    return qpos
+
+
+def walking(frames: int = 31) -> np.ndarray:
+    """Returns a cycle of poses `[frames, nq]`: half a metre ahead while both legs swing."""
+    turn = np.linspace(0.0, 2.0 * np.pi, frames)
+    qpos = standing(frames)
+    qpos[:, 0] = 0.5 * turn / (2.0 * np.pi)
+    qpos[:, LEFT_HIP], qpos[:, RIGHT_HIP] = 0.2 * np.sin(turn), -0.2 * np.sin(turn)
+    half = 0.05 * np.sin(turn)
+    qpos[:, SPINE] = np.stack((np.cos(half), 0 * half, 0 * half, np.sin(half)), 1)
+    return qpos
+
+
+def make_motion(who: Character, qpos: np.ndarray, loop: bool, seconds: float = 1.0) -> Motion:
+    """Returns the motion through evenly timed poses."""
+    return motion.from_qpos(who.model, qpos, np.linspace(0.0, seconds, len(qpos)), loop)
+
+
+def write_clip(folder: Path) -> Path:
+    """Writes the walk as `walking.npz`; returns its path."""
+    qpos = walking()
+    hips = [np.stack((np.cos(a / 2), 0 * a, -np.sin(a / 2), 0 * a), 1) for a in qpos[:, 11:].T]
+    made = clip_data.build(
+        "walking",
+        "walking",
+        np.linspace(0.0, 1.0, len(qpos)),
+        ("spine", "left_hip", "right_hip"),
+        qpos[:, :3],
+        qpos[:, 3:7],
+        np.stack((qpos[:, SPINE], *hips), axis=1),
+        loop=True,
+    )
+    return clip.save(made, folder / "walking.npz")
+
+
+def make_physics(who: Character, substeps: int = 4) -> tuple[Physics, object]:
+    """Returns the cpu physics on one thread and the loaded model."""
+    engine = physics_lib.make("cpu", substeps, num_envs=1, threads=1)
+    return engine, engine.load([character.compile(who, motion.CONTROL_DT / substeps)])
+
+
+def make_env(
+    who: Character,
+    reference: Motion,
+    config: core.EnvConfig = core.EnvConfig(),  # noqa: B008  frozen
+    sizes: bounds.BoundsConfig | None = None,
+) -> core.Environment:
+    """Returns the environment of the walker on the cpu physics."""
+    engine, model = make_physics(who, config.substeps)
+    made = bounds.make(who, sizes or bounds.BoundsConfig())
+    return core.make(who, reference, engine, model, made, config)
+
+
+def train_config(folder: Path, **changes) -> TrainConfig:
+    """Returns a training of the walker that an update takes milliseconds of."""
+    settings = {
+        "clip": str(write_clip(folder)),
+        "character": str(write_character(folder)),
+        "backend": "cpu",
+        "envs": 8,
+        "horizon": 4,
+        "networks": NetworkConfig(policy=(16,), value=(16,)),
+        "ppo": PPOConfig(epochs=2, minibatch=16),
+    }
+    return TrainConfig(**(settings | changes))
