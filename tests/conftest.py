@@ -4,14 +4,14 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import pytest
 
+from jaxskills import physics
 from jaxskills.errors import UserError
 from jaxskills.paths import deepmimic_dir
 
-# MJX under vmap can wait for ever on two cores otherwise; it must be set before a backend starts.
-jax.config.update("jax_cpu_enable_async_dispatch", False)
+# Before jax uses a device: MJX under vmap can wait for ever on two cores otherwise.
+physics.configure_cpu()
 
 
 @pytest.fixture(scope="session", autouse=True)

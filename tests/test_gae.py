@@ -44,7 +44,9 @@ def _chained(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _advantages(rows: dict[str, np.ndarray], lambda_: float, gamma: float = GAMMA) -> np.ndarray:
-    found = gae.advantages(**{k: jnp.asarray(v) for k, v in rows.items()}, gamma=gamma, lambda_=lambda_)
+    found = gae.advantages(
+        **{k: jnp.asarray(v) for k, v in rows.items()}, gamma=gamma, lambda_=lambda_
+    )
     return np.asarray(found)
 
 

@@ -13,51 +13,31 @@ import jaxskills
 
 # A module imports only from modules above it. A folder's `__init__` is its last line.
 ORDER: list[str] = """
-errors
-paths
-rotation
-clip
-pose
+errors paths compilation
+
+rotation pose
+clip_data roles clip_deepmimic clip_bvh keyframes clip
 character
-retarget
-check
-keyframes
-kinematics
-motion
-physics.base
-physics.ffi
-physics.cpu
-physics.mjx
-physics
-env.observe
-env.bounds
-env.rewards
-env.core
-env
-learn.networks
-learn.normalize
-learn.rollout
-learn.gae
-learn.ppo
-learn
-explore.starts
-explore
-trainer
-evaluate
-render
+hinges posed mapping retarget measures repairs faults check
+kinematics ground motion
+
+physics.quiet physics.ffi physics.base physics.cpu physics.mjx physics.servo physics
+env.observe env.bounds env.rewards env.core env
+learn.networks learn.normalize learn.gae learn.ppo learn.rollout learn
+explore.starts explore
+
+trainer checkpoint evaluate train
+render.opengl render.stage render.take render.video render.strip render
 plot
-recipes
-train
-commands
-cli
-__main__
+
+recipes progress arguments commands cli __main__
 """.split()
 
-# Packages of an extra, and what the command line needs for some commands only: imported when used.
-IN_FUNCTIONS = {"pybvh", "pybullet_data", "warp", "jaxskills.commands", "jaxskills.recipes"}
+# A package of an extra, and what is slow and seldom needed: imported when used.
+IN_FUNCTIONS = {"pybvh", "jaxskills.physics.mjx", "jaxskills.commands", "jaxskills.recipes"}
 
 MAX_LINES = 400
-MAX_FUNCTION_LINES = 60  # without the docstring
+MAX_FUNCTION_LINES = 60
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SOURCE = REPOSITORY / "src" / "jaxskills"
@@ -99,6 +79,18 @@ def _functions(tree: ast.AST) -> Iterator[Function]:
     yield from (node for node in ast.walk(tree) if isinstance(node, Function))
 
 
+def _own_lines(function: Function) -> int:
+    """Lines of the body without its docstring and without the functions defined in it."""
+    body = function.body[1:] if ast.get_docstring(function) else function.body
+    inner = [node for part in body for node in ast.walk(part) if isinstance(node, Function)]
+    lines = {line for node in body for line in _span(node)}
+    return len(lines - {line for node in inner for line in _span(node)})
+
+
+def _span(node: ast.stmt) -> range:
+    return range(node.lineno, (node.end_lineno or node.lineno) + 1)
+
+
 def _public(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[str, Documented]]:
     """Public functions and classes, and the public methods of those classes."""
     for node in body:
@@ -133,14 +125,16 @@ def test_imports_stand_at_the_top(name: str):
 def test_fits_on_a_screen(name: str):
     assert len(MODULES[name].read_text().splitlines()) <= MAX_LINES
     for function in _functions(TREES[name]):
-        first = function.body[1 if ast.get_docstring(function) and function.body[1:] else 0]
-        lines = (function.end_lineno or 0) - first.lineno + 1
+        lines = _own_lines(function)
         assert lines <= MAX_FUNCTION_LINES, f"{name}.{function.name} has {lines} lines"
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_is_documented(name: str):
-    assert MODULES[name].read_text().startswith("# SPDX-License-Identifier: Apache-2.0\n")
+    text = MODULES[name].read_text()
+    if not text and name in {"env", "learn", "explore"}:
+        return  # a bare folder
+    assert text.startswith("# SPDX-License-Identifier: Apache-2.0\n")
     assert ast.get_docstring(TREES[name]), f"{name} does not say what it is"
     missing = [path for path, node in _public(TREES[name].body) if not ast.get_docstring(node)]
     assert not missing

@@ -220,7 +220,11 @@ def test_velocities_are_the_rates_of_the_poses(who: Character, loop: bool):
     step = 1e-2
     phases = np.linspace(1.0, 28.0, 40)
     sample = _sampler(who, made)
-    (ahead, _), (behind, _), (_, qvel) = sample(phases + step), sample(phases - step), sample(phases)
+    (ahead, _), (behind, _), (_, qvel) = (
+        sample(phases + step),
+        sample(phases - step),
+        sample(phases),
+    )
     found = pose.minus(who.layout, jnp.asarray(ahead), jnp.asarray(behind))
     found = np.asarray(found) / (2.0 * step * CONTROL_DT)
     np.testing.assert_allclose(qvel, found, atol=0.03)

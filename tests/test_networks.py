@@ -73,9 +73,15 @@ def test_log_prob_is_the_gaussian_density_up_to_a_constant():
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (NetworkConfig(policy=()), "networks.policy is (): give positive layer sizes, like 512 256"),
+        (
+            NetworkConfig(policy=()),
+            "networks.policy is (): give positive layer sizes, like 512 256",
+        ),
         (NetworkConfig(value=(8, 0)), "networks.value is (8, 0): give positive layer sizes"),
-        (NetworkConfig(noise=0.0), "networks.noise is 0.0: give a standard deviation in (0, 10] rad"),
+        (
+            NetworkConfig(noise=0.0),
+            "networks.noise is 0.0: give a standard deviation in (0, 10] rad",
+        ),
         (NetworkConfig(noise=11.0), "networks.noise is 11.0: give"),
         (NetworkConfig(noise=float("nan")), "networks.noise is nan: give"),
     ],

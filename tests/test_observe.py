@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The observation does not see where the walker is or faces, only how it stands to the reference."""
+"""The observation does not tell where the walker is or faces, only how it stands to the target."""
 
 from collections.abc import Callable
 

@@ -2,11 +2,11 @@
 """What every physics backend promises, checked against plain C `mj_step` loops."""
 
 import dataclasses
+import functools
 import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ from jaxskills.errors import UserError
 from jaxskills.physics import cpu, ffi
 
 physics.configure_cpu()
+
+pytestmark = pytest.mark.timeout(300)
 
 SUBSTEPS = 4
 ROWS = 6
@@ -95,15 +97,33 @@ def make_case(name: str, models: list[mujoco.MjModel]) -> Case:
     )
 
 
-@pytest.fixture(
-    scope="module",
-    params=["cpu", "callback", "mjx", pytest.param("warp", marks=pytest.mark.slow)],
-)
-def case(request: pytest.FixtureRequest) -> Iterator[Case]:
-    """One backend after the other; the models differ in mass, and in gravity."""
-    if request.param == "warp" and importlib.util.find_spec("warp") is None:
+def needs_warp(name: str) -> str:
+    """Skips the warp cases where it is not installed."""
+    if name == "warp" and importlib.util.find_spec("warp") is None:
         pytest.skip("warp-lang is not installed")
-    yield make_case(request.param, [toy(), toy(mass=3.0), toy(gravity=-1.6)])
+    return name
+
+
+@functools.cache
+def shared_case(name: str) -> Case:
+    """The backend with models that differ in mass and in gravity, compiled once for all tests."""
+    return make_case(name, [toy(), toy(mass=3.0), toy(gravity=-1.6)])
+
+
+SLOW_WARP = pytest.param("warp", marks=[pytest.mark.slow, pytest.mark.timeout(1200)])  # kernels
+SLOW_MJX = pytest.param("mjx", marks=pytest.mark.slow)  # each new shape compiles for 15 s
+
+
+@pytest.fixture(params=["cpu", "callback", "mjx", SLOW_WARP])
+def case(request: pytest.FixtureRequest) -> Case:
+    """One backend after the other."""
+    return shared_case(needs_warp(request.param))
+
+
+@pytest.fixture(params=["cpu", "callback", SLOW_MJX, SLOW_WARP])
+def reshaped_case(request: pytest.FixtureRequest) -> Case:
+    """The same, for tests that compile the step in other shapes."""
+    return shared_case(needs_warp(request.param))
 
 
 def inputs(rows: int = ROWS, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -183,7 +203,8 @@ def test_the_warm_start_is_part_of_the_state(case: Case):
     assert bits(second) == bits(case.step(case.loaded, VARIANT, copied, ctrl[1]))
 
 
-def test_vmapped_equals_looped_and_nested(case: Case):
+def test_vmapped_equals_looped_and_nested(reshaped_case: Case):
+    case = reshaped_case
     qpos, qvel, ctrl = inputs()
     state = case.start(qpos, qvel)
     together = flat(case.step(case.loaded, VARIANT, state, ctrl[0]))
@@ -253,7 +274,8 @@ def test_a_blow_up_is_reported_and_stays_until_init(case: Case):
     assert not case.start(qpos, qvel).diverged.any()
 
 
-def test_scan_equals_single_steps(case: Case):
+def test_scan_equals_single_steps(reshaped_case: Case):
+    case = reshaped_case
     qpos, qvel, ctrl = inputs()
     state = case.start(qpos, qvel)
 
@@ -448,8 +470,8 @@ def run_alone(script: str, tmp_path: Path, **variables: str) -> str:
 
 
 CACHED = """
-import jax, jax.numpy as jnp, sys
-jax.config.update("jax_compilation_cache_dir", sys.argv[-1] if False else "cache")
+import jax
+jax.config.update("jax_compilation_cache_dir", "cache")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 import test_physics_contract as t
@@ -476,7 +498,8 @@ def test_a_second_process_finds_the_program_in_the_cache(tmp_path):
 
 CROWD = """
 from jaxskills import physics
-import jax, jax.numpy as jnp
+import jax
+import jax.numpy as jnp
 import test_physics_contract as t
 qpos, qvel, ctrl = t.inputs(64)
 engine = physics.make("mjx", 2, num_envs=64)

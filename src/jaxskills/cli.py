@@ -12,6 +12,7 @@ import io
 import json
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -104,11 +105,19 @@ def _one_line() -> Iterator[None]:
 
 
 def _unboxed(box: str) -> str:
-    """Returns the sentences of a box, without its frame, its title and its pointers to help."""
-    rows = [row.strip("│ ") for row in box.splitlines() if row.startswith("│")]
-    parts = " ".join("|" if set(row) == {"─"} else row for row in rows if row).split("|")
-    kept = [part.strip() for part in parts if "helptext" not in part]
-    return "; ".join(kept) or box
+    """Returns the sentences of a box, without its frame, its title and its pointers to help.
+
+    Where standard output is not UTF-8 the frame is of blanks, and the title has rows of its own.
+    """
+    rows = [row.strip("│ ") for row in box.splitlines() if row[0] not in "╭╰"]
+    sections = [[]]
+    for row in rows if "│" in box else rows[2:]:
+        if set(row) in ({"─"}, {"-"}):
+            sections.append([])
+        elif row:
+            sections[-1].append(row)
+    sentences = [" ".join(section) for section in sections]
+    return "; ".join(text for text in sentences if "helptext" not in text) or box
 
 
 def _perform(command: Any, settings: Any) -> int:
@@ -127,6 +136,8 @@ def _commands() -> ModuleType:
     """Returns `jaxskills.commands`, and with it imports JAX, which takes a second or two."""
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / PROGRAM
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
+    # XLA's threads and a fork do not go together, but what forks here at once becomes ffmpeg.
+    warnings.filterwarnings("ignore", message="os.fork", category=RuntimeWarning)
     from jaxskills import commands
 
     return commands

@@ -32,14 +32,18 @@ def read(path: Path) -> Clip:
     import pybvh
 
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        if not path.read_text(encoding="utf-8-sig").strip():
+            raise UserError(f"clip '{path}' is empty")
         bvh = pybvh.read_bvh_file(path, world_up="+y")
+    except UserError:
+        raise
     except (OSError, UnicodeDecodeError, ValueError, IndexError) as error:
         raise UserError(f"clip '{path}' is not a sound BVH file: {_line(error)}") from None
-    if not text.strip():
-        raise UserError(f"clip '{path}' is empty")
+    _finite(path, bvh)
     nodes = [node for node in bvh.nodes if not node.is_end_site()]
     names = tuple(node.name for node in nodes)
+    if len(names) < 2:
+        raise UserError(f"clip '{path}' has no joint besides its root")
     parents = tuple(names.index(node.parent.name) - 1 for node in nodes[1:] if node.parent)
     offsets = np.array([node.offset for node in nodes[1:]])
     raw = Skeleton(parents, offsets)
@@ -63,6 +67,16 @@ def read(path: Path) -> Clip:
         skeleton=Skeleton(parents, unit * offsets @ turn.T),
         file_angles=dict(zip(names[1:], map(float, peaks[1:]), strict=True)),
     )
+
+
+def _finite(path: Path, bvh: Any) -> None:
+    frames = np.concatenate([bvh.root_pos, bvh.joint_angles.reshape(len(bvh.root_pos), -1)], axis=1)
+    bad = np.flatnonzero(~np.isfinite(frames).all(axis=1))
+    if bad.size:
+        raise UserError(f"clip '{path}': frame {bad[0]} holds a number that is not finite")
+    for node in bvh.nodes:
+        if not np.isfinite(node.offset).all():
+            raise UserError(f"clip '{path}': the offset of {node.name} is not finite")
 
 
 def _tips(bvh: Any, names: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -140,4 +154,4 @@ def _axis_name(axis: np.ndarray) -> str:
 
 
 def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
+    return " ".join(str(error).split(";")[0].split())

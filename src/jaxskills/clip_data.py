@@ -78,11 +78,20 @@ def build(
       UserError: too few frames, shapes that disagree, NaN, times that do not increase, a zero
         quaternion.
     """
-    times, root_pos = np.asarray(times, float), np.asarray(root_pos, float)
-    quats = np.concatenate(
-        [np.asarray(root_rot, float)[:, None], np.asarray(rotations, float)], axis=1
-    )
     names = ("root", *joints)
+    times, root_pos = np.asarray(times, float), np.asarray(root_pos, float)
+    root_rot, rotations = np.asarray(root_rot, float), np.asarray(rotations, float)
+    frames, count = len(times), len(joints)
+    if (root_pos.shape, root_rot.shape) != ((frames, 3), (frames, 4)) or (
+        rotations.shape != (frames, count, 4)
+    ):
+        raise UserError(
+            f"clip '{source}': {frames} times and {count} joints go with root_pos"
+            f" {list(root_pos.shape)}, root_rot {list(root_rot.shape)}, rotations"
+            f" {list(rotations.shape)}: expected [{frames}, 3], [{frames}, 4] and"
+            f" [{frames}, {count}, 4]"
+        )
+    quats = np.concatenate([root_rot[:, None], rotations], axis=1)
     _check(source, times, root_pos, quats, names)
     norms = np.linalg.norm(quats, axis=-1)
     quats = quats / norms[..., None]
@@ -111,14 +120,8 @@ def _check(
     quats: np.ndarray,
     names: tuple[str, ...],
 ) -> None:
-    frames = len(times)
-    if frames < 2:
-        raise UserError(f"clip '{source}' has {frames} frame(s): at least 2 are needed")
-    if root_pos.shape != (frames, 3) or quats.shape != (frames, len(names), 4):
-        raise UserError(
-            f"clip '{source}': {frames} times go with positions {list(root_pos.shape)} and"
-            f" quaternions {list(quats.shape)}: expected [{frames}, 3], [{frames}, {len(names)}, 4]"
-        )
+    if len(times) < 2:
+        raise UserError(f"clip '{source}' has {len(times)} frame(s): at least 2 are needed")
     if len(set(names)) != len(names):
         twice = sorted({n for n in names if names.count(n) > 1})
         raise UserError(f"clip '{source}': joint '{twice[0]}' is listed twice: names must differ")

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each command does: from its arguments to an answer, as text and as data."""
 
+import contextlib
 import dataclasses
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ def train(command: arguments.Train, config: TrainConfig) -> Answer:
     run, name = command.out, recipes.find(command.skill).name
     done = max(checkpoint.existing(run), default=0) if command.resume else 0
     print(f"{name}: compiling, which takes a minute or two the first time", file=sys.stderr)
-    with progress.live(name, config.samples, done) as report:
+    with progress.live(name, config.samples, done) as report, _enough_memory(config):
         made, state, last = train_lib.train(config, run, report, command.resume)
     if last["why"] == "interrupted":
         text = f"interrupted: {last['samples']} samples are saved in '{run}', --resume goes on"
@@ -154,6 +155,18 @@ def _film(made: Trainer, state: TrainState, path: Path, seconds: float) -> Path:
     cycle = made.motion.seconds if made.motion.loop else None
     fps = 1.0 / CONTROL_DT
     return render.film(made.character, qpos[:last], reference[:last], path, fps=fps, cycle=cycle)
+
+
+@contextlib.contextmanager
+def _enough_memory(config: TrainConfig) -> Iterator[None]:
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise UserError(
+            f"envs is {config.envs}, horizon {config.horizon}: too many for the memory, give fewer"
+        ) from None
 
 
 def _absolute(name: str) -> str:

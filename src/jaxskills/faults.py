@@ -127,9 +127,17 @@ def _two_causes(clip: Clip) -> Iterator[tuple[tuple[tuple[str, str], ...], Clip]
 
 def _flips(character: Character, clip: Clip, mapping: Mapping) -> list[Finding]:
     """Hinges outside their range most of the time that would be inside with the sign flipped."""
-    moved = transfer(character, clip, mapping)
+
+    def accused(one: Clip) -> dict[str, str]:
+        moved = transfer(character, one, mapping)
+        return {**_hinge_flips(character, moved), **_ball_knees(character, one)}
+
+    flipped = accused(clip)
+    # With arms out at the zero pose, exchanged elbows bend backwards too: that is for `_sides`.
+    if flipped and not accused(repairs.swap_sides(clip)):
+        return []
     found = []
-    for source, text in {**_hinge_flips(character, moved), **_ball_knees(character, clip)}.items():
+    for source, text in flipped.items():
         clip = repairs.flip(clip, source)
         found.append(Finding("fault", "flipped_hinge", text, clip))
     return found

@@ -207,6 +207,12 @@ def _check(keyframes: Keyframes) -> None:
                 f"{what}: axes of {joint} are '{axes}': write one to three of x, y, z, each with an"
                 " optional -, such as '-yxz'"
             )
+    if not isinstance(keyframes.loop, bool):
+        raise UserError(f"{what}: loop is {keyframes.loop}: choose true or false")
+    _numbers(f"{what}: rate", keyframes.rate, 1)
+    _numbers(f"{what}: travel", keyframes.travel, 3)
+    if keyframes.duration is not None:
+        _numbers(f"{what}: duration", keyframes.duration, 1)
     for index, key in enumerate(keyframes.keys):
         _check_key(f"{what}: pose {index}", key, keyframes.axes)
     times = np.array([key.time for key in keyframes.keys], float)
@@ -223,7 +229,6 @@ def _check(keyframes: Keyframes) -> None:
         raise UserError(f"{what}: duration is for loops; without one it is the last pose's time")
     if not 1.0 <= keyframes.rate <= 1000.0:
         raise UserError(f"{what}: rate {keyframes.rate} Hz: choose 1 to 1000")
-    _numbers(f"{what}: travel", keyframes.travel, 3)
 
 
 def _check_key(what: str, key: Key, axes: Mapping[str, str]) -> None:
@@ -239,7 +244,7 @@ def _check_key(what: str, key: Key, axes: Mapping[str, str]) -> None:
 def _numbers(what: str, value: object, count: int) -> None:
     try:
         array = np.atleast_1d(np.asarray(value, float))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
     if array.shape != (count,) or not np.isfinite(array).all():
         raise UserError(f"{what} is {value}: give {count} finite number{'s' * (count > 1)}")

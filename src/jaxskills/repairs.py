@@ -27,6 +27,7 @@ UNITS = {
     "feet, but was read as metres": 0.3048,
     "metres, but was read as centimetres": 100.0,
     "metres, but was read as millimetres": 1000.0,
+    "millimetres, but was read as centimetres": 0.1,
     "metres, but was read as inches": 1.0 / 0.0254,
 }
 

@@ -163,6 +163,7 @@ def line(
         "kl": float(total["kl"] / count),
         "clipped": float(total["clipped"] / count),
         "value_loss": float(total["value_loss"] / count),
+        "policy_lr": float(total["policy_lr"] / count),
         "diverged": int(total["diverged"]),
         "worst_bound": made.env.endings[cause],
         "worst_phase": round((float(place) + 0.5) / endings.shape[1], 3),

@@ -11,6 +11,8 @@ from flax import struct
 from jaxskills.errors import UserError
 from jaxskills.learn.networks import Networks, Params, log_prob
 
+_LR_STEP, _LR_RANGE = 1.5, (1e-6, 1e-2)
+
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
@@ -19,10 +21,13 @@ class PPOConfig:
     discount: float = 0.98  # per control frame; SB section 5: 0.95
     lambda_: float = 0.95  # SB section 5, for GAE and TD alike
     clip: float = 0.2
-    epochs: int = 5
-    minibatch: int = 256  # SB section 5
-    policy_lr: float = 2e-5  # Adam
+    epochs: int = 4
+    minibatch: int = 512  # SB section 5: 256
+    policy_lr: float = 3e-5  # Adam, to begin with
     value_lr: float = 1e-3  # Adam
+    # The policy's step size follows the change it makes: down by a half where an update moves the
+    # policy by more than twice this, up where by less than half of it. 0 keeps it as it is.
+    target_kl: float = 0.015
     max_grad_norm: float = 10.0
 
 
@@ -34,6 +39,7 @@ class Learner:
     value: Params
     policy_opt: optax.OptState
     value_opt: optax.OptState
+    policy_lr: jax.Array  # []
 
 
 @struct.dataclass
@@ -51,17 +57,18 @@ def optimizers(
     config: PPOConfig,
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
     """Returns the optimisers of the policy and of the value function."""
-    make = lambda lr: optax.chain(  # noqa: E731
-        optax.clip_by_global_norm(config.max_grad_norm), optax.adam(lr)
-    )
-    return make(config.policy_lr), make(config.value_lr)
+    clip = optax.clip_by_global_norm(config.max_grad_norm)
+    # The policy's step size is in the learner.
+    policy = optax.chain(clip, optax.scale_by_adam(), optax.scale(-1.0))
+    return policy, optax.chain(clip, optax.adam(config.value_lr))
 
 
 def init(config: PPOConfig, networks: Networks, key: jax.Array) -> Learner:
     """Returns a fresh learner. The key is consumed."""
     policy, value = networks.init(key)
     policy_opt, value_opt = optimizers(config)
-    return Learner(policy, value, policy_opt.init(policy), value_opt.init(value))
+    states = policy_opt.init(policy), value_opt.init(value)
+    return Learner(policy, value, *states, jnp.float32(config.policy_lr))
 
 
 def policy_loss(
@@ -103,18 +110,29 @@ def update(
             learner.policy, networks, part, config.clip
         )
         step, policy_state = policy_opt.update(grad, learner.policy_opt, learner.policy)
+        step = jax.tree.map(lambda x: learner.policy_lr * x, step)
         policy = optax.apply_updates(learner.policy, step)
         loss, grad = jax.value_and_grad(value_loss)(learner.value, networks, part)
         step, value_state = value_opt.update(grad, learner.value_opt, learner.value)
         value = optax.apply_updates(learner.value, step)
         watched["value_loss"] = loss
-        return Learner(policy, value, policy_state, value_state), watched
+        return Learner(policy, value, policy_state, value_state, learner.policy_lr), watched
 
     keys = jax.random.split(key, config.epochs)
     order = jax.vmap(lambda k: jax.random.permutation(k, size))(keys)
     rows = order[:, : count * config.minibatch].reshape(-1, config.minibatch)
     learner, watched = jax.lax.scan(minibatch_step, learner, rows)
-    return learner, jax.tree.map(jnp.mean, watched)
+    lr = next_lr(config, learner.policy_lr, jnp.mean(watched["kl"][-count:]))
+    return learner.replace(policy_lr=lr), jax.tree.map(jnp.mean, watched) | {"policy_lr": lr}
+
+
+def next_lr(config: PPOConfig, lr: jax.Array, kl: jax.Array) -> jax.Array:
+    """Returns the policy's next step size `[]`, after a last epoch with mean divergence `kl []`."""
+    if config.target_kl == 0.0:
+        return lr
+    down, up = kl > 2.0 * config.target_kl, kl < 0.5 * config.target_kl
+    factor = jnp.where(down, 1.0 / _LR_STEP, jnp.where(up, _LR_STEP, 1.0))
+    return jnp.clip(lr * factor, *_LR_RANGE)
 
 
 def validate(config: PPOConfig, batch_size: int) -> None:
@@ -130,6 +148,8 @@ def validate(config: PPOConfig, batch_size: int) -> None:
     for name in ("clip", "policy_lr", "value_lr", "max_grad_norm"):
         if not getattr(config, name) > 0:
             raise UserError(f"ppo.{name} is {getattr(config, name)}: give a positive number")
+    if not config.target_kl >= 0:
+        raise UserError(f"ppo.target_kl is {config.target_kl}: give 0 (off) or more")
     if config.epochs < 1:
         raise UserError(f"ppo.epochs is {config.epochs}: give 1 or more")
     if not 1 <= config.minibatch <= batch_size:

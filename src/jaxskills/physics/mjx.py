@@ -6,7 +6,10 @@ coordinates, velocities and warm start, so it is rebuilt from a template at each
 """
 
 import contextlib
+import copy
+import dataclasses
 import functools
+import importlib
 import io
 from collections.abc import Sequence
 from typing import Any
@@ -23,6 +26,9 @@ from jaxskills.physics.base import Physics, SimState, admit, check, settle, star
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints where warp-lang is missing
     from mujoco import mjx
+
+OVERFLOW = 0b11111
+"""Warp's overflow bits that mean lost contacts or constraint rows (`OverflowType`, NEFC to CCD)."""
 
 MARGIN = 2
 """Contact and constraint capacity for Warp, as a multiple of what a C rollout reached."""
@@ -54,18 +60,17 @@ def load(models: Sequence[mujoco.MjModel], impl: str, num_envs: int) -> MjxModel
     check(models)
     sizes = capacity(models, num_envs) if impl == "warp" else {}
     try:
-        worlds = [
-            (mjx.put_model(m, impl=impl), mjx.make_data(m, impl=impl, **sizes)) for m in models
-        ]
+        worlds = [_put(_without_autoreset_flag(model), impl, sizes) for model in models]
     except NotImplementedError as error:
         raise UserError(f"backend with impl '{impl}' cannot run this model: {error}") from None
     leaves = [jax.tree.leaves(world) for world in worlds]
-    structure = jax.tree.structure(worlds[0])
-    if any(jax.tree.structure(world) != structure for world in worlds):
-        raise UserError(
-            "physics models differ in something MJX compiles in: vary masses, sizes, positions,"
-            " gains, gravity, friction, but not contact masks, types, flags or which limits exist"
-        )
+    for world in worlds[1:]:
+        if jax.tree.structure(world) != jax.tree.structure(worlds[0]):
+            field = _static_difference(worlds[0][0], world[0]) or "their sizes"
+            raise UserError(
+                f"physics models differ in {field}, which MJX compiles in: vary masses, sizes,"
+                " positions, gains, gravity or friction"
+            )
     columns = [[np.asarray(leaf) for leaf in column] for column in zip(*leaves, strict=True)]
     where = tuple(
         i for i, column in enumerate(columns) if any((x != column[0]).any() for x in column)
@@ -76,6 +81,34 @@ def load(models: Sequence[mujoco.MjModel], impl: str, num_envs: int) -> MjxModel
         home=jnp.asarray(np.stack([m.qpos0 for m in models]), jnp.float32),
         where=where,
     )
+
+
+def _put(model: mujoco.MjModel, impl: str, sizes: dict[str, int]) -> tuple[mjx.Model, mjx.Data]:
+    """Returns the model on the device, and a Data of it."""
+    placed = mjx.put_model(model, impl=impl)
+    if impl == "warp":  # it would print from the device; `_advance_warp` reports instead
+        placed = placed.tree_replace({"opt._impl.warn_overflow": 0})
+    return placed, mjx.make_data(model, impl=impl, **sizes)
+
+
+def _without_autoreset_flag(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns a copy without the flag that turns the reset of C MuJoCo off: Warp refuses it."""
+    model = copy.copy(model)
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return model
+
+
+def _static_difference(one: Any, other: Any) -> str | None:
+    """Returns the name of a field that is no array on the device and differs, if there is one."""
+    for field in dataclasses.fields(one):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if dataclasses.is_dataclass(a):
+            name = _static_difference(a, b)
+            if name:
+                return name
+        elif not isinstance(a, jax.Array) and not np.array_equal(a, b):
+            return field.name
+    return None
 
 
 def capacity(models: Sequence[mujoco.MjModel], num_envs: int) -> dict[str, int]:
@@ -129,12 +162,20 @@ def _advance_warp(world: tuple[mjx.Model, mjx.Data], state: SimState, ctrl: Any,
     overflow = jnp.zeros((), bool)
     for _ in range(substeps):
         data = mjx.step(model, data)
-        overflow |= data._impl.overflow != 0
+        overflow |= (data._impl.overflow & OVERFLOW) != 0
     return SimState(data.qpos, data.qvel, data.qacc_warmstart, diverged=overflow)
+
+
+def _quiet_warp() -> None:
+    """Keeps Warp from printing each kernel it compiles: standard output belongs to the user."""
+    warp = importlib.import_module("warp")
+    warp.config.log_level = warp.LOG_WARNING
 
 
 def make(impl: str, substeps: int, num_envs: int) -> Physics:
     """Returns the mjx (`impl='jax'`) or the warp backend."""
+    if impl == "warp":
+        _quiet_warp()
     advance = _advance_warp if impl == "warp" else _advance
 
     def step(model: MjxModel, variant: jax.Array, state: SimState, ctrl: jax.Array) -> SimState:

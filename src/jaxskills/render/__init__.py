@@ -35,9 +35,9 @@ def film(
     """Writes a film (.mp4, .gif) or a film strip (.png) and returns its path.
 
     The camera follows the simulation from its right. The ghost goes at its far side, as much ahead
-    or behind as the reference is, but at most a third of a stature, so that it stays in the picture;
-    with `overlay` it is exactly where the reference is. In a strip it has the upper row, with
-    `overlay` the same one.
+    or behind as the reference is, but at most a third of a stature, so that it stays in sight; with
+    `overlay` it is exactly where the reference is. In a strip it has the upper row, with `overlay`
+    the same one. A pose that is not finite ends the film.
 
     Args:
       character: who moves.
@@ -52,7 +52,7 @@ def film(
       panels: pictures in a strip.
 
     Raises:
-      UserError: another suffix, arrays of another shape or not finite, nothing to render with.
+      UserError: another suffix, arrays of another shape, nothing to render with.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -257,8 +257,8 @@ def _set_lights(stage: Stage, lookat: np.ndarray) -> None:
         light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
         light.texid, light.headlight, light.castshadow = -1, not is_sun, is_sun
         light.attenuation[:] = 1.0, 0.0, 0.0
-        light.ambient[:] = 0.0 if is_sun else 0.42
-        light.diffuse[:] = 0.5 if is_sun else 0.3
+        light.ambient[:] = 0.0 if is_sun else 0.45
+        light.diffuse[:] = 0.45 if is_sun else 0.4
         light.specular[:] = 0.1 if is_sun else 0.0
         light.dir[:] = sun if is_sun else scene.camera[0].forward
         light.pos[:] = lookat - 3 * stage.body * sun if is_sun else scene.camera[0].pos

@@ -50,9 +50,9 @@ def draw(take: Take, width: int, seconds: float, panels: int, overlay: bool) -> 
     rows = _rows(take, moments, overlay)
     lens = stage.Lens(float(np.degrees(take.heading)) + _AZIMUTH, _ELEVATION, 1.0, _FOVY)
     aside, low, high = _extent(take.character.model, rows, lens)
-    aside, low, high = np.array([aside, low, high]) + take.body * np.array(
-        [_ASIDE, -_BELOW, _ABOVE]
-    )
+    aside += _ASIDE * take.body
+    low -= _BELOW * take.body
+    high += _ABOVE * take.body
     lens = dataclasses.replace(lens, distance=(high - low) / 2 / np.tan(np.radians(_FOVY / 2)))
     wide = max((width - (count - 1) * _GAP) // count, 1)
     tall = round(wide * (high - low) / (2 * aside))

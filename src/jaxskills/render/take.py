@@ -39,25 +39,33 @@ def checked(
     labels: Sequence[str] | None,
     fps: float,
 ) -> Take:
-    """Returns the take; labels are the time in s unless given.
+    """Returns the take, up to the first pose that is not finite (a simulation may diverge).
+
+    Labels are the time in s unless given.
 
     Raises:
-      UserError: a wrong number of poses, coordinates or labels, a pose that is not finite.
+      UserError: a wrong number of poses, coordinates or labels; no finite pose at the beginning.
     """
     if not fps > 0:
         raise UserError(f"fps is {fps}: give a number > 0")
     qpos = _poses(character, "qpos", qpos)
-    body = stage.stature(character.model)
-    if reference is not None:
-        reference = _poses(character, "reference_qpos", reference)
-        if len(reference) != len(qpos):
-            raise UserError(f"reference_qpos has {len(reference)} poses: qpos has {len(qpos)}")
     if labels is None:
         labels = [f"{i / fps:.2f} s" for i in range(len(qpos))]
     if len(labels) != len(qpos):
         raise UserError(f"there are {len(labels)} labels: qpos has {len(qpos)} poses")
+    good = np.isfinite(qpos.sum(1))
+    if reference is not None:
+        reference = _poses(character, "reference_qpos", reference)
+        if len(reference) != len(qpos):
+            raise UserError(f"reference_qpos has {len(reference)} poses: qpos has {len(qpos)}")
+        good &= np.isfinite(reference.sum(1))
+    end = len(good) if good.all() else int(good.argmin())
+    if end == 0:
+        raise UserError("nothing to film: the first pose is not finite")
+    qpos, reference = qpos[:end], None if reference is None else reference[:end]
+    body = stage.stature(character.model)
     heading = _heading(character, qpos if reference is None else reference, body)
-    return Take(character, qpos, reference, tuple(labels), fps, heading, body)
+    return Take(character, qpos, reference, tuple(labels[:end]), fps, heading, body)
 
 
 def lookat(take: Take, qpos: np.ndarray) -> np.ndarray:
@@ -80,9 +88,6 @@ def _poses(character: Character, name: str, given: np.ndarray) -> np.ndarray:
     poses, nq = np.asarray(given, float), character.model.nq
     if poses.ndim != 2 or poses.shape[1] != nq or not len(poses):
         raise UserError(f"{name} has shape {poses.shape}: {character.name} needs (T, {nq}), T > 0")
-    bad = ~np.isfinite(poses).all(1)
-    if bad.any():
-        raise UserError(f"{name}: pose {int(bad.argmax())} is not finite: end the film before it")
     return poses
 
 
@@ -100,7 +105,5 @@ def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
     """Returns values [T] under a Gaussian of `sigma` samples; past the ends they move on evenly."""
     reach = int(3 * sigma) + 1
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    inside = min(reach, len(values) - 1)
-    padded = np.pad(values, inside, mode="reflect", reflect_type="odd")
-    padded = np.pad(padded, reach - inside, mode="edge")
+    padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
     return np.convolve(padded, kernel / kernel.sum(), mode="valid")

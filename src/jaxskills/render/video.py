@@ -46,11 +46,11 @@ def write_mp4(path: Path, take: Take, size: tuple[int, int], overlay: bool) -> N
     writer = imageio_ffmpeg.write_frames(
         str(path),
         size,
-        fps=take.fps,
+        fps=take.fps,  # pyright: ignore[reportArgumentType]
         codec="libx264",
-        quality=None,
+        quality=6,  # crf 20
         macro_block_size=2,
-        output_params=["-preset", "fast", "-crf", "20", "-movflags", "+faststart"],
+        output_params=["-preset", "fast", "-movflags", "+faststart"],
         ffmpeg_log_level="error",
     )
     writer.send(None)

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evaluation: figures of a trace by hand, and a walker that stands or cannot."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny
+
+from jaxskills import clip, evaluate, trainer
+from jaxskills.compilation import jit
+from jaxskills.errors import UserError
+from jaxskills.evaluate import EvaluateConfig, Trace
+
+
+def _trace(fallen: list[list[int]], outside: list[list[int]]) -> Trace:
+    """Returns a trace whose rows are episodes."""
+    by_step = lambda rows: jnp.asarray(np.array(rows, bool).T)  # noqa: E731
+    nothing = dict.fromkeys(("qpos", "phase", "errors", "sizes", "com", "torque"), jnp.zeros(()))
+    return Trace(inside=~by_step(outside), fallen=by_step(fallen), **nothing)
+
+
+def test_figures_by_hand():
+    """Four episodes of three steps: never, at the second step, at once (and up again), never."""
+    fallen = [[0, 0, 0], [0, 1, 1], [1, 0, 0], [0, 0, 0]]
+    outside = [[0, 0, 0], [1, 1, 1], [1, 1, 1], [0, 0, 1]]
+    found = evaluate.summary(_trace(fallen, outside))
+    assert found == pytest.approx(
+        {
+            "success_rate": 0.5,
+            "seconds_mean": (3 + 1 + 0 + 3) / 4 / 30,
+            "inside_bounds_rate": 0.25,
+            "inside_seconds_mean": (3 + 0 + 0 + 2) / 4 / 30,
+            "episodes": 4,
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory: pytest.TempPathFactory) -> trainer.Trainer:
+    """A walker that is asked to stand still."""
+    folder = tmp_path_factory.mktemp("walker")
+    config = tiny.train_config(folder)
+    walk = clip.load(config.clip)
+    still = dataclasses.replace(
+        walk,
+        root_pos=np.tile([0.0, 0.0, 0.5], (31, 1)),
+        rotations=np.tile([1.0, 0.0, 0.0, 0.0], (31, 3, 1)),
+    )
+    path = clip.save(still, folder / "still.npz")
+    return trainer.make(dataclasses.replace(config, clip=str(path)))
+
+
+def test_a_walker_that_stands_stands(standing: trainer.Trainer):
+    state = standing.init(jax.random.key(0))
+    config = EvaluateConfig(seconds=2.0, episodes=3)
+    trace = jit(evaluate.make(standing, config))(state, jax.random.key(1))
+    assert trace.qpos.shape == (60, 3, 13)
+    assert trace.errors.shape == trace.sizes.shape == (60, 3, 10)
+    np.testing.assert_allclose(np.diff(trace.phase, axis=0), 1.0, atol=1e-4)
+    found = evaluate.summary(trace)
+    assert found["success_rate"] == found["inside_bounds_rate"] == 1.0
+    assert found["seconds_mean"] == pytest.approx(2.0)
+    assert found["episodes"] == 3
+
+
+def test_a_finer_engine_is_another_simulation_of_the_same_length(standing: trainer.Trainer):
+    state = standing.init(jax.random.key(0))
+    traces = [
+        jit(evaluate.make(standing, EvaluateConfig(0.5, 2, substeps)))(state, jax.random.key(1))
+        for substeps in (None, 20)
+    ]
+    np.testing.assert_array_equal(traces[0].phase, traces[1].phase)
+    assert not np.array_equal(traces[0].qpos, traces[1].qpos)
+    np.testing.assert_allclose(traces[0].com, traces[1].com, atol=0.02)
+
+
+def test_a_walker_with_limp_legs_falls_and_the_time_until_then_counts(
+    standing: trainer.Trainer, tmp_path: Path
+):
+    toml = tiny.write_character(tmp_path).with_suffix(".toml")
+    strong, limp = "kp = 80.0, kd = 8.0, torque = 40.0", "kp = 0.1, kd = 0.01, torque = 0.1"
+    toml.write_text(toml.read_text().replace(strong, limp))
+    changed = {"character": str(toml.with_suffix(".xml"))}
+    made = trainer.make(dataclasses.replace(standing.config, **changed))
+    state = made.init(jax.random.key(0))
+    trace = jit(evaluate.make(made, EvaluateConfig(2.0, 3)))(state, jax.random.key(1))
+    found = evaluate.summary(trace)
+    assert found["success_rate"] == 0.0
+    assert 0.1 < found["seconds_mean"] < 1.9
+    assert found["inside_seconds_mean"] < found["seconds_mean"] + 1e-6
+
+
+def test_the_policys_mean_is_played_not_its_noise(standing: trainer.Trainer):
+    state = standing.init(jax.random.key(0))
+    run = jit(evaluate.make(standing, EvaluateConfig(0.2, 2)))
+    again = [run(state, jax.random.key(4)) for _ in range(2)]
+    np.testing.assert_array_equal(again[0].qpos, again[1].qpos)
+    loud = standing._replace(networks=standing.networks._replace(noise=9.0))
+    other = jit(evaluate.make(loud, EvaluateConfig(0.2, 2)))(state, jax.random.key(4))
+    np.testing.assert_array_equal(other.qpos, again[0].qpos)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (EvaluateConfig(seconds=0.0), "seconds is 0.0: give 1/30 to 3600"),
+        (EvaluateConfig(seconds=4000.0), "seconds is 4000.0: give 1/30 to 3600"),
+        (EvaluateConfig(episodes=0), "episodes is 0: give 1 to 65536"),
+        (EvaluateConfig(substeps=101), "substeps is 101: give 1 to 100"),
+        (EvaluateConfig(substeps=0), "substeps is 0: give 1 to 100"),
+    ],
+)
+def test_what_is_out_of_range_is_refused(standing, config: EvaluateConfig, message: str):
+    with pytest.raises(UserError) as raised:
+        evaluate.make(standing, config)
+    assert message in str(raised.value)
+    assert "\n" not in str(raised.value)

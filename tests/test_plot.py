@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plots: what the axes hold, read back from matplotlib, and the page as a picture."""
+
+import dataclasses
+import subprocess
+import sys
+
+import matplotlib.colors
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from PIL import Image
+
+from jaxskills import plot
+from jaxskills.errors import UserError
+
+METRICS = [
+    {"samples": 1e6, "wall_s": 60.0, "survival_s": 0.5, "ended/com_z": 0.75, "ended/root": 0.25},
+    {"samples": 2e6, "wall_s": 120.0, "survival_s": 2.0, "ended/com_z": 1.0, "seconds_mean": 5.0},
+    {"samples": 4e6, "wall_s": 300.0, "survival_s": 6.0, "ended/time limit": 1.0},
+]
+
+
+@pytest.fixture
+def axes() -> Axes:
+    return Figure().add_subplot()
+
+
+def _lines(axes: Axes) -> dict[str, np.ndarray]:
+    return {str(line.get_label()): np.asarray(line.get_xydata()) for line in axes.lines}
+
+
+def _texts(axes: Axes) -> list[str]:
+    legend = axes.get_legend()
+    return [] if legend is None else [text.get_text() for text in legend.get_texts()]
+
+
+def test_learning_curve(axes):
+    plot.learning_curve(METRICS, axes)
+    lines = _lines(axes)
+    assert np.array_equal(lines["training, until a bound"], [[1, 0.5], [2, 2.0], [4, 6.0]])
+    assert np.array_equal(lines["test, until a fall"], [[2, 5.0]])
+    assert set(lines) == {"training, until a bound", "test, until a fall"}
+    assert axes.get_title(loc="left") == "Learning curve: 4 million samples, 5 min"
+    assert axes.get_ylim()[0] == 0 and "(s)" in axes.get_ylabel()
+
+
+def test_causes_stack_to_the_whole(axes):
+    plot.causes(METRICS, axes)
+    assert _texts(axes) == ["root", "time limit", "com_z"]  # the largest at the bottom
+    tops = [band.get_paths()[0].vertices for band in axes.collections]
+    assert max(top[:, 1].max() for top in tops) == pytest.approx(100.0)
+    bottom = tops[0]
+    assert bottom[np.isclose(bottom[:, 0], 1.0), 1].max() == pytest.approx(75.0)
+    assert bottom[:, 0].min() == 0.0
+
+
+def test_causes_before_any_episode_has_ended(axes):
+    plot.causes([{"samples": 10, "wall_s": 1.0, "survival_s": 0.0}], axes)
+    assert [text.get_text() for text in axes.texts] == ["no episode has ended yet"]
+
+
+def test_causes_keep_the_largest_and_sum_the_rest(axes):
+    shares = {f"ended/b{i}": 0.01 * (i + 1) for i in range(13)}
+    plot.causes([{"samples": 1e6, "wall_s": 1.0, "survival_s": 1.0, **shares}], axes)
+    assert _texts(axes) == ["7 others", "b7", "b8", "b9", "b10", "b11", "b12"]
+    others = axes.collections[-1].get_paths()[0].vertices
+    assert np.ptp(others[:, 1]) == pytest.approx(100 * sum(0.01 * (i + 1) for i in range(7)))
+
+
+def test_com_height_is_fig_5(axes):
+    phase, height = np.array([0.1, 0.5, 0.9]), np.array([0.9, 1.0, 0.95])
+    plot.com_height(phase, height, np.array([0.0, 1.0]), np.array([0.9, 1.0]), 0.2, axes)
+    lines = {line.get_color(): line for line in axes.lines}
+    green = [line for colour, line in lines.items() if _hue(colour) == "green"]
+    assert np.array_equal(np.asarray(green[0].get_ydata()), [0.9, 1.0])
+    red = [np.asarray(line.get_ydata()) for line in axes.lines if _hue(line.get_color()) == "red"]
+    assert np.allclose(sorted(y[0] for y in red), [0.7, 1.1])
+    dots = next(c for c in axes.collections if isinstance(c, PathCollection))
+    assert np.array_equal(dots.get_offsets(), np.stack([phase, height], 1))
+    assert _hue(dots.get_facecolor()[0]) == "blue"
+    assert _texts(axes) == ["learnt", "reference", "bounds"]
+
+
+def _hue(colour) -> str:
+    return ("red", "green", "blue")[int(np.argmax(matplotlib.colors.to_rgb(colour)))]
+
+
+def test_com_height_thins_out_very_many_dots(axes):
+    many = np.linspace(0, 1, 100_001)
+    plot.com_height(many, many, many[:2], many[:2], 0.2, axes)
+    dots = next(c for c in axes.collections if isinstance(c, PathCollection))
+    assert 10_000 < len(np.asarray(dots.get_offsets())) <= 20_000
+
+
+def test_margins_show_mean_and_worst_of_the_tightest(axes):
+    phase = np.array([0.001, 0.002, 0.999])
+    by_bound = {
+        "wide": np.array([0.9, 0.9, 0.9]),
+        "tight": np.array([0.4, 0.2, -0.1]),
+    }
+    plot.margins(phase, by_bound, axes, shown=1)
+    assert _texts(axes) == ["tight"]
+    mean = _lines(axes)["tight"]
+    assert np.allclose(mean[:, 1], [0.3, -0.1])
+    assert mean[0, 0] < 0.05 and mean[1, 0] > 0.95
+    worst = [np.asarray(line.get_ydata()) for line in axes.lines if line.get_linestyle() == "--"]
+    assert np.allclose(worst, [[0.2, -0.1]])
+    assert any(np.array_equal(line.get_ydata(), [0, 0]) for line in axes.lines)  # the bound
+
+
+def test_endings_map(axes):
+    counts = {"com_z": np.array([0, 2, 1]), "root": np.array([5, 0, 0]), "neck": np.zeros(3)}
+    plot.endings(counts, axes)
+    assert np.array_equal(np.asarray(axes.images[0].get_array()), [[5, 0, 0], [0, 2, 1]])
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["root (5)", "com_z (3)"]
+    assert axes.get_title(loc="left") == "Where 8 tested episodes left the bounds"
+
+
+def test_endings_where_there_were_none(axes):
+    plot.endings({"com_z": np.zeros(3)}, axes)
+    assert not axes.images
+    assert [text.get_text() for text in axes.texts] == ["none did"]
+
+
+PLAYED = plot.Played(
+    phase=np.linspace(0, 1, 50),
+    height=np.full(50, 0.9),
+    reference_phase=np.array([0.0, 1.0]),
+    reference_height=np.array([0.9, 0.9]),
+    bound=0.2,
+    margins={"com_z": np.linspace(0, 1, 50), "root": np.full(50, 0.5)},
+    endings={"com_z": np.array([1, 2]), "root": np.array([0, 1])},
+)
+
+
+def test_page(tmp_path):
+    path = plot.figure(tmp_path / "new" / "walk.png", "walk", METRICS, PLAYED)
+    full = np.asarray(Image.open(path).convert("L"), float)
+    short = np.asarray(
+        Image.open(plot.figure(tmp_path / "short.png", "walk", METRICS, None)).convert("L"), float
+    )
+    assert full.shape[1] == short.shape[1] == 11 * 150
+    assert full.shape[0] > 2 * short.shape[0]
+    # Each of the three rows holds ink: one row of pictures is a third of the page.
+    thirds = np.array_split(full, 3)
+    assert all((third < 128).mean() > 0.005 for third in thirds)
+
+
+def test_page_without_tested_endings(tmp_path):
+    none = dataclasses.replace(PLAYED, endings={"com_z": np.zeros(4)})
+    assert plot.figure(tmp_path / "walk.svg", "walk", METRICS[:1], none).stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("path", "metrics", "message"),
+    [
+        ("a.jpeg", METRICS, "unknown picture format '.jpeg': choose one of .png, .pdf, .svg"),
+        ("a.png", [], "there is nothing to plot: metrics.jsonl has no lines yet"),
+        ("a.png", [METRICS[0], {"samples": 1}], "line 2 of metrics.jsonl lacks wall_s, survival_s"),
+    ],
+)
+def test_bad_input_is_named(tmp_path, path, metrics, message):
+    with pytest.raises(UserError, match=f"^{message}$"):
+        plot.figure(tmp_path / path, "walk", metrics, None)
+
+
+def test_no_window_is_opened():
+    """Neither pyplot nor a toolkit is loaded, whatever MPLBACKEND says."""
+    program = "import sys; from jaxskills import plot; print('matplotlib.pyplot' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "False\n")
