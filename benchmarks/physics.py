@@ -143,7 +143,7 @@ def measure(args: argparse.Namespace) -> dict:
 
 def main() -> None:
     """Parses the command line, measures and prints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Times the physics backends.")
     parser.add_argument("--character", default="humanoid34", help="shipped name or MJCF file")
     parser.add_argument("--envs", type=int, default=64)
     parser.add_argument("--steps", type=int, default=60, help="control steps per run")

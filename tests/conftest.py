@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every test shares: a throw-away home folder, calm CPU dispatch, the real clips if there."""
+"""What every test shares: a home folder and compiled code for the session, the real clips."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import pytest
 
 from jaxskills import physics
@@ -22,9 +23,13 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setenv("HOME", str(folder))
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
         patch.setenv("MPLBACKEND", "agg")
-        # The command line caches compiled code for its user; tests compile afresh.
-        patch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
         yield folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What one test has compiled the next ones find, as runs of the command line do."""
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
 
 
 @pytest.fixture(scope="session")

@@ -28,7 +28,7 @@ explore.starts explore
 
 trainer checkpoint evaluate train
 render.opengl render.stage render.take render.video render.strip render
-plot
+plot playback
 
 recipes progress arguments commands cli __main__
 """.split()

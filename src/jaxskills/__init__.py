@@ -5,13 +5,47 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxskills.character import Character as Character
+    from jaxskills.clip_data import Clip as Clip
+    from jaxskills.env.bounds import BoundsConfig as BoundsConfig
+    from jaxskills.env.core import EnvConfig as EnvConfig
+    from jaxskills.env.core import Environment as Environment
     from jaxskills.errors import UserError as UserError
+    from jaxskills.evaluate import EvaluateConfig as EvaluateConfig
+    from jaxskills.evaluate import Trace as Trace
+    from jaxskills.explore.starts import StartsConfig as StartsConfig
+    from jaxskills.learn.networks import NetworkConfig as NetworkConfig
+    from jaxskills.learn.ppo import PPOConfig as PPOConfig
+    from jaxskills.mapping import Mapping as Mapping
+    from jaxskills.motion import Motion as Motion
+    from jaxskills.motion import MotionConfig as MotionConfig
+    from jaxskills.recipes import Recipe as Recipe
+    from jaxskills.trainer import TrainConfig as TrainConfig
+    from jaxskills.trainer import Trainer as Trainer
+    from jaxskills.trainer import TrainState as TrainState
 
 __version__ = "0.1.0"
 
 # Public name -> its module. A name is imported on first use, so that `jaxskills --help` and a
 # mistyped command need not wait for JAX.
 _MODULE = {
+    "BoundsConfig": "env.bounds",
+    "Character": "character",
+    "Clip": "clip_data",
+    "EnvConfig": "env.core",
+    "Environment": "env.core",
+    "EvaluateConfig": "evaluate",
+    "Mapping": "mapping",
+    "Motion": "motion",
+    "MotionConfig": "motion",
+    "NetworkConfig": "learn.networks",
+    "PPOConfig": "learn.ppo",
+    "Recipe": "recipes",
+    "StartsConfig": "explore.starts",
+    "Trace": "evaluate",
+    "TrainConfig": "trainer",
+    "TrainState": "trainer",
+    "Trainer": "trainer",
     "UserError": "errors",
 }
 

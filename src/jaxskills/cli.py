@@ -77,7 +77,7 @@ def _parse_train(typed: list[str]) -> tuple[arguments.Train, Any]:
     recipe = recipes.find(typed[0]) if named else None
     commands = _commands()
     first = _read_train(typed, commands.settings(recipe))
-    return first, _read_train(typed, commands.settings_of(first)).config
+    return first, _read_train(typed, commands.settings_of(first, first.config)).config
 
 
 def _read_train(typed: list[str], settings: Any) -> Any:

@@ -63,7 +63,7 @@ def read(path: Path) -> Clip:
         local[:, 0],
         local[:, 1:],
         loop=False,
-        notes=(axes, f"lengths read as {unit_name}"),
+        notes=(axes, f"lengths read as {unit_name}", "BVH does not say if it loops: read as not"),
         skeleton=Skeleton(parents, unit * offsets @ turn.T),
         file_angles=dict(zip(names[1:], map(float, peaks[1:]), strict=True)),
     )

@@ -3,6 +3,7 @@
 
 import contextlib
 import dataclasses
+import json
 import os
 import sys
 from collections.abc import Iterable, Iterator
@@ -10,22 +11,28 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
-from jaxskills import arguments, check, checkpoint, clip, paths, physics, progress, recipes, render
+from jaxskills import (
+    arguments,
+    check,
+    checkpoint,
+    clip,
+    paths,
+    physics,
+    playback,
+    plot,
+    progress,
+    recipes,
+    render,
+)
 from jaxskills import character as character_lib
 from jaxskills import evaluate as evaluate_lib
-from jaxskills import motion as motion_lib
 from jaxskills import retarget as retarget_lib
 from jaxskills import train as train_lib
 from jaxskills import trainer as trainer_lib
-from jaxskills.compilation import jit
 from jaxskills.errors import UserError, unknown
-from jaxskills.motion import CONTROL_DT
 from jaxskills.recipes import Recipe
 from jaxskills.trainer import TrainConfig, Trainer, TrainState
-
-_AFTER_FALL = 1.0  # s of film after the character has fallen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +58,8 @@ def perform(command: Any, settings: Any) -> Answer:
             return evaluate(command)
         case arguments.Render():
             return film(command)
+        case arguments.Plot():
+            return picture(command)
         case arguments.ClipsList():
             return clips_list()
         case arguments.ClipsCheck():
@@ -70,20 +79,22 @@ def settings(recipe: Recipe | None) -> TrainConfig:
     )
 
 
-def settings_of(command: arguments.Train) -> TrainConfig:
+def settings_of(command: arguments.Train, config: TrainConfig) -> TrainConfig:
     """Returns the settings that the options change: the recipe's, or the resumed run's.
 
+    Args:
+      command: says which.
+      config: the recipe's settings with the options.
+
     Raises:
-      UserError: there is no such run, or it learns something else.
+      UserError: there is no such run, or it learns another clip.
     """
-    fresh = settings(recipes.find(command.skill))
     if not command.resume:
-        return fresh
+        return settings(recipes.find(command.skill))
     saved = checkpoint.read_config(command.out)
-    if (saved.clip, saved.character) != (fresh.clip, fresh.character):
+    if saved.clip != _absolute(config.clip):
         raise UserError(
-            f"run '{command.out}' learns '{saved.clip}' on '{saved.character}', not"
-            f" '{fresh.clip}' on '{fresh.character}': give another --out"
+            f"run '{command.out}' learns '{saved.clip}', not '{config.clip}': give another --out"
         )
     return saved
 
@@ -104,7 +115,7 @@ def train(command: arguments.Train, config: TrainConfig) -> Answer:
     lines = [f"{name}: {last['why']} after {last['samples']} samples, {last['wall_s']:.0f} s"]
     for path in (run / f"{name}.mp4", run / f"{name}.png"):
         try:
-            lines.append(f"wrote {_film(made, state, path, seconds=10.0)}")
+            lines.append(f"wrote {playback.film(made, state, path, seconds=10.0)}")
         except UserError as error:  # nothing to draw with: the controller is there all the same
             lines.append(f"no {path.name}: {error}")
     return Answer("\n".join(lines), last)
@@ -116,7 +127,7 @@ def evaluate(command: arguments.Evaluate) -> Answer:
     config = evaluate_lib.EvaluateConfig(
         command.seconds, command.episodes, command.substeps, command.seed
     )
-    trace = jit(evaluate_lib.make(made, config))(state, jax.random.key(command.seed))
+    trace = playback.play(made, state, config)
     data = {
         **evaluate_lib.summary(trace),
         "samples": train_lib.samples_of(made.config, state),
@@ -131,7 +142,18 @@ def film(command: arguments.Render) -> Answer:
     """Films the controller of a run beside its reference."""
     _admit(command.out, render.FORMATS)
     made, state = _open(command.run, command.backend)
-    path = _film(made, state, command.out, command.seconds)
+    path = playback.film(made, state, command.out, command.seconds)
+    return Answer(f"wrote {path}", {"out": str(path)})
+
+
+def picture(command: arguments.Plot) -> Answer:
+    """Plots the training of a run, and what its controller does."""
+    _admit(command.out, plot.FORMATS)
+    made, state = _open(command.run, "auto")
+    metrics = _metrics(command.run / "metrics.jsonl")
+    trace = playback.play(made, state, evaluate_lib.EvaluateConfig())
+    title = f"{Path(made.config.clip).stem} on {made.character.name}"
+    path = plot.figure(command.out, title, metrics, playback.played(made, trace))
     return Answer(f"wrote {path}", {"out": str(path)})
 
 
@@ -140,21 +162,6 @@ def _open(run: Path, backend: str) -> tuple[Trainer, TrainState]:
     config: Any = dataclasses.replace(checkpoint.read_config(run), backend=backend)
     made = trainer_lib.make(config)
     return made, checkpoint.restore(run, made)
-
-
-def _film(made: Trainer, state: TrainState, path: Path, seconds: float) -> Path:
-    """Films one episode, until shortly after a fall."""
-    config = evaluate_lib.EvaluateConfig(seconds, episodes=1)
-    trace = jit(evaluate_lib.make(made, config))(state, jax.random.key(config.seed))
-    qpos, phase = np.asarray(trace.qpos[:, 0]), trace.phase[:, 0]
-    ended = np.asarray(trace.fallen[:, 0])
-    last = (ended.argmax() if ended.any() else len(qpos)) + round(_AFTER_FALL / CONTROL_DT)
-    layout = made.character.layout
-    at = jax.vmap(lambda p: motion_lib.sample(layout, made.motion, p)[0])
-    reference = np.asarray(jit(at)(phase))
-    cycle = made.motion.seconds if made.motion.loop else None
-    fps = 1.0 / CONTROL_DT
-    return render.film(made.character, qpos[:last], reference[:last], path, fps=fps, cycle=cycle)
 
 
 @contextlib.contextmanager
@@ -167,6 +174,17 @@ def _enough_memory(config: TrainConfig) -> Iterator[None]:
         raise UserError(
             f"envs is {config.envs}, horizon {config.horizon}: too many for the memory, give fewer"
         ) from None
+
+
+def _metrics(path: Path) -> list[dict[str, Any]]:
+    """Returns the lines of a metrics.jsonl, up to one that a kill cut off."""
+    rows = []
+    for line in path.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
 
 
 def _absolute(name: str) -> str:

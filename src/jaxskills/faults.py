@@ -126,7 +126,7 @@ def _two_causes(clip: Clip) -> Iterator[tuple[tuple[tuple[str, str], ...], Clip]
 
 
 def _flips(character: Character, clip: Clip, mapping: Mapping) -> list[Finding]:
-    """Hinges outside their range most of the time that would be inside with the sign flipped."""
+    """Hinges often outside their range that would be inside with the sign flipped."""
 
     def accused(one: Clip) -> dict[str, str]:
         moved = transfer(character, one, mapping)
@@ -152,7 +152,7 @@ def _hinge_flips(character: Character, moved: Transfer) -> dict[str, str]:
         values = (limit.values + np.pi) % (2.0 * np.pi) - np.pi
         outside = float((limit.excess(values) > 0).mean())
         inside = float((limit.excess(-values) == 0).mean())
-        if outside > 0.5 and inside > 0.9:
+        if outside > 0.2 and inside > 0.95:
             accused[sources[limit.joint]] = (
                 f"{_bends(sources[limit.joint])}: {outside:.0%} of the time outside the range"
                 f" [{limit.low:.2f}, {limit.high:.2f}] rad of {limit.joint} (mean"
@@ -173,7 +173,7 @@ def _ball_knees(character: Character, clip: Clip) -> dict[str, str]:
         local = clip.rotations[:, clip.joints.index(source)]
         bend = hinges.twist(Rotation.from_quat(local, scalar_first=True), np.array([0.0, 1.0, 0.0]))
         backwards = float((bend < -_BENT).mean())
-        if backwards > 0.5 and (bend > _BENT).mean() < 0.1:
+        if backwards > 0.2 and (bend > _BENT).mean() < 0.05:
             accused[source] = (
                 f"{_bends(source)}: {backwards:.0%} of the time its shin points forward (by"
                 f" {np.degrees(-bend.min()):.0f} degrees at most): flip the axis"

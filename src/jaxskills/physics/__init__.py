@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Physics: three engines behind one interface of three pure functions (see `base.Physics`).
 
-  cpu   C MuJoCo on all cores, called from inside jit; the default where there is no accelerator
-  mjx   MuJoCo in XLA: any accelerator, gradients
-  warp  MuJoCo Warp: the default on NVIDIA
+- cpu: C MuJoCo on all cores, called from inside jit; the default where there is no accelerator
+- mjx: MuJoCo in XLA: any accelerator, gradients
+- warp: MuJoCo Warp: the default on NVIDIA
 """
 
 import importlib.util

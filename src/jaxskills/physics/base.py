@@ -27,7 +27,7 @@ class SimState:
     Attributes:
       qpos: [nq] float32, MuJoCo coordinates (m, rad, quaternions wxyz). Finite after a step.
       qvel: [nv] float32, velocities (m/s, rad/s). Finite after a step.
-      engine: what the backend needs besides: the solver's warm start `qacc_warmstart`, [nv] float32.
+      engine: what the backend carries besides: [nv] float32, the solver's `qacc_warmstart`.
       diverged: [] bool, true once a step failed: qpos and qvel are then those before it, not a
         simulation. It stays true until `init`.
     """
@@ -87,7 +87,7 @@ def admit(home: jax.Array, state: SimState, ctrl: jax.Array) -> tuple[SimState, 
 
 
 def settle(before: SimState, after: SimState) -> SimState:
-    """Returns `after`, or `before` marked as diverged where a step went wrong or was not allowed."""
+    """Returns `after`, or `before` marked as diverged where either of them is unsound."""
     ok = sound(after.qpos, after.qvel, after.engine) & ~after.diverged & ~before.diverged
     kept = jax.tree.map(lambda new, old: jnp.where(ok, new, old), after, before)
     return kept.replace(diverged=~ok)

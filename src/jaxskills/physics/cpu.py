@@ -86,7 +86,7 @@ def load(models: Sequence[mujoco.MjModel], threads: int) -> CpuModel:
     for model in models:
         content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, content)
-        hashed.update(content)
+        hashed.update(content.data)
     digest = hashed.digest()
     handle = int.from_bytes(digest[:4], "big") >> 1
     with _registry:
@@ -97,8 +97,8 @@ def load(models: Sequence[mujoco.MjModel], threads: int) -> CpuModel:
         _simulators.move_to_end(handle)
         while len(_simulators) > KEPT:
             _simulators.popitem(last=False)
-    home = np.stack([model.qpos0 for model in models]).astype(np.float32)
-    return CpuModel(handle=np.int32(handle), home=home)  # pyright: ignore[reportArgumentType]
+    home = np.stack([model.qpos0 for model in models])
+    return CpuModel(jnp.asarray(handle, jnp.int32), jnp.asarray(home, jnp.float32))
 
 
 def _runner(simulator: _Simulator, count: int) -> _Runner:
@@ -199,9 +199,9 @@ def make(substeps: int, threads: int | None) -> Physics:
     use_ffi = not forced and ffi.register(TARGET, _advance)
 
     def step(model: CpuModel, variant: jax.Array, state: SimState, ctrl: jax.Array) -> SimState:
-        job = jnp.stack([jnp.asarray(model.handle, jnp.int32), jnp.int32(substeps)])
+        job = jnp.stack([model.handle, jnp.int32(substeps)])
         ctrl = jnp.asarray(ctrl, jnp.float32)
-        before, ctrl = admit(jnp.asarray(model.home)[variant], state, ctrl)
+        before, ctrl = admit(model.home[variant], state, ctrl)
         return settle(before, _call(job, variant, before, ctrl, use_ffi))
 
     return Physics(

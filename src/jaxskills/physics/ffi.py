@@ -20,7 +20,7 @@ _METADATA = 1  # XLA_FFI_Extension_Metadata
 _EXECUTE = 3  # XLA_FFI_ExecutionStage_EXECUTE
 _INTERNAL = 13  # XLA_FFI_Error_Code_INTERNAL
 
-_DTYPES: dict[int, type[np.generic]] = {1: np.bool_, 4: np.int32, 11: np.float32}  # XLA_FFI_DataType
+_DTYPES = {1: np.dtype(bool), 4: np.dtype(np.int32), 11: np.dtype(np.float32)}  # XLA_FFI_DataType
 
 _Kernel = Callable[[list[np.ndarray], list[np.ndarray]], None]
 
@@ -89,7 +89,7 @@ def _views(buffers: ctypes.Structure) -> list[np.ndarray]:
     for i in range(buffers.size):
         buffer = buffers.items[i].contents
         shape = buffer.dims[: buffer.rank]
-        dtype = np.dtype(_DTYPES[buffer.dtype])
+        dtype = _DTYPES[buffer.dtype]
         nbytes = dtype.itemsize
         for length in shape:
             nbytes *= length

@@ -83,7 +83,7 @@ def load(models: Sequence[mujoco.MjModel], impl: str, num_envs: int) -> MjxModel
     )
 
 
-def _put(model: mujoco.MjModel, impl: str, sizes: dict[str, int]) -> tuple[mjx.Model, mjx.Data]:
+def _put(model: mujoco.MjModel, impl: str, sizes: dict[str, Any]) -> tuple[Any, mjx.Data]:
     """Returns the model on the device, and a Data of it."""
     placed = mjx.put_model(model, impl=impl)
     if impl == "warp":  # it would print from the device; `_advance_warp` reports instead
@@ -114,7 +114,8 @@ def _static_difference(one: Any, other: Any) -> str | None:
 def capacity(models: Sequence[mujoco.MjModel], num_envs: int) -> dict[str, int]:
     """Returns Warp's array sizes: `naconmax` contacts in all, `njmax` constraint rows per world.
 
-    Bodies are thrown on the floor in C for a second; `MARGIN` times the most they needed.
+    Bodies are thrown on the floor in C for a second; `MARGIN` times the most they needed, rounded
+    up to a power of two, so that other variants of a character fit the same program.
     """
     contacts, rows = 8, 32
     random = np.random.default_rng(0)
@@ -129,7 +130,8 @@ def capacity(models: Sequence[mujoco.MjModel], num_envs: int) -> dict[str, int]:
         for _ in range(int(1.0 / model.opt.timestep)):
             drop.step()
             contacts, rows = max(contacts, ncon.max()), max(rows, nefc.max())
-    return {"naconmax": int(MARGIN * contacts * num_envs), "njmax": int(MARGIN * rows)}
+    contacts, rows = (1 << (MARGIN * int(x) - 1).bit_length() for x in (contacts, rows))
+    return {"naconmax": contacts * num_envs, "njmax": rows}
 
 
 def _world(model: MjxModel, variant: jax.Array) -> tuple[mjx.Model, mjx.Data]:
@@ -156,9 +158,7 @@ def _advance(world: tuple[mjx.Model, mjx.Data], state: SimState, ctrl: Any, subs
 def _advance_warp(world: tuple[mjx.Model, mjx.Data], state: SimState, ctrl: Any, substeps: int):
     """Steps Warp's own Data, since its buffers are better kept than filled anew each substep."""
     model, data = world
-    data = data.replace(
-        qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.engine, ctrl=ctrl
-    )
+    data = data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.engine, ctrl=ctrl)
     overflow = jnp.zeros((), bool)
     for _ in range(substeps):
         data = mjx.step(model, data)

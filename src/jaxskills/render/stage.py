@@ -61,7 +61,7 @@ class Stage:
     lens: Lens
     width: int
     height: int
-    body: float  # m, height of the character
+    body: float  # m, stature of the character
     floor: float  # m
     scene: mujoco.MjvScene
     context: mujoco.MjrContext
@@ -142,9 +142,9 @@ def picture(
 
 
 def stature(model: mujoco.MjModel) -> float:
-    """Returns the height of the character at its zero pose in m."""
-    low, high = reach(model, model.qpos0, UP)
-    return high - low
+    """Returns the height or length in m of the character at its zero pose, whichever is larger."""
+    low, high = np.array([reach(model, model.qpos0, axis) for axis in np.eye(3)]).T
+    return float((high - low).max())
 
 
 def reach(model: mujoco.MjModel, qpos: np.ndarray, direction: np.ndarray) -> tuple[float, float]:

@@ -18,9 +18,9 @@ _FINE = 2  # drawn this much larger, then shrunk, for smooth edges
 # Nearly a side view through a long lens, so that panels fit together: degrees.
 _AZIMUTH, _ELEVATION, _FOVY = 105.0, -8.0, 12.0
 
-# In statures: free space at the sides, below, and above where the label stands.
-_ASIDE, _BELOW, _ABOVE = 0.08, 0.1, 0.3
-_TEXT = 0.11  # of the width of a panel
+_ASIDE, _BELOW = 0.08, 0.1  # free space at the sides and below, in statures
+_TEXT = 0.11  # size of the letters, of the width of a panel
+_LEADING = 1.3  # between two lines, in letters
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ def draw(take: Take, width: int, seconds: float, panels: int, overlay: bool) -> 
     aside, low, high = _extent(take.character.model, rows, lens)
     aside += _ASIDE * take.body
     low -= _BELOW * take.body
-    high += _ABOVE * take.body
+    high += 2 * aside * _TEXT * (0.5 + _LEADING * (1 if take.reference is None else 2))
     lens = dataclasses.replace(lens, distance=(high - low) / 2 / np.tan(np.radians(_FOVY / 2)))
     wide = max((width - (count - 1) * _GAP) // count, 1)
     tall = round(wide * (high - low) / (2 * aside))
@@ -104,4 +104,4 @@ def _write(panel: Image.Image, label: str, name: str) -> None:
     pen = ImageDraw.Draw(panel)
     pen.text((margin, margin), label, INK, font)
     colour = INK if name == "simulation" else GREEN
-    pen.text((margin, margin + 1.3 * size), name, colour, font)
+    pen.text((margin, margin + _LEADING * size), name, colour, font)

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A trained controller played back, for films and for pictures."""
+
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+
+from jaxskills import evaluate, motion, plot, render
+from jaxskills.compilation import jit
+from jaxskills.evaluate import EvaluateConfig, Trace
+from jaxskills.motion import CONTROL_DT
+from jaxskills.trainer import PHASE_BINS, Trainer, TrainState
+
+_AFTER_FALL = 1.0  # s of film after the character has fallen
+
+
+def play(made: Trainer, state: TrainState, config: EvaluateConfig) -> Trace:
+    """Returns what the controller does in the episodes of a configuration.
+
+    Raises:
+      UserError: a value out of range.
+    """
+    return jit(evaluate.make(made, config))(state, jax.random.key(config.seed))
+
+
+def film(made: Trainer, state: TrainState, path: Path, seconds: float) -> Path:
+    """Films one episode beside its reference, until shortly after a fall; returns `path`.
+
+    Raises:
+      UserError: another suffix than `render.FORMATS`, or nothing to draw with.
+    """
+    trace = play(made, state, EvaluateConfig(seconds, episodes=1))
+    until = _lengths(np.asarray(trace.fallen))[0] + round(_AFTER_FALL / CONTROL_DT)
+    qpos = np.asarray(trace.qpos)[:until, 0]
+    reference = _reference(made, np.asarray(trace.phase)[:until, 0])
+    cycle = made.motion.seconds if made.motion.loop else None
+    return render.film(made.character, qpos, reference, path, fps=1.0 / CONTROL_DT, cycle=cycle)
+
+
+def played(made: Trainer, trace: Trace) -> plot.Played:
+    """Returns the states of a trace up to each fall, as `plot.figure` wants them."""
+    length = made.env.length
+    errors, sizes, inside = (np.asarray(x) for x in (trace.errors, trace.sizes, trace.inside))
+    steps, episodes, count = errors.shape
+    names = made.env.endings[:count]
+    standing = np.arange(steps)[:, None] < _lengths(np.asarray(trace.fallen))
+    margins = (1.0 - errors / sizes)[standing]
+    phase = np.asarray(trace.phase) % length / length
+    grid = np.linspace(0.0, 1.0, 101)
+    up = names.index("com_z")
+    return plot.Played(
+        phase=phase[standing],
+        height=np.asarray(trace.com)[..., 2][standing],
+        reference_phase=grid,
+        reference_height=_com_height(made.character.model, _reference(made, grid * length)),
+        bound=float(sizes[..., up].min()),
+        margins={name: margins[:, i] for i, name in enumerate(names)},
+        endings=_endings(names, errors / sizes, inside, phase),
+    )
+
+
+def _endings(
+    names: tuple[str, ...], share: np.ndarray, inside: np.ndarray, phase: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Returns per bound how many episodes left it first, by part of the cycle `[PHASE_BINS]`."""
+    counts = {name: np.zeros(PHASE_BINS) for name in (*names, "ground contact")}
+    for episode, step in enumerate(_lengths(~inside)):
+        if step == len(inside):
+            continue
+        worst = int(share[step, episode].argmax())
+        cause = names[worst] if share[step, episode, worst] > 1.0 else "ground contact"
+        place = min(int(phase[step, episode] * PHASE_BINS), PHASE_BINS - 1)
+        counts[cause][place] += 1
+    return counts
+
+
+def _lengths(ended: np.ndarray) -> np.ndarray:
+    """Returns per episode `[E]` how many steps come before the first true one of `ended [T, E]`."""
+    return np.where(ended.any(0), ended.argmax(0), len(ended))
+
+
+def _reference(made: Trainer, phase: np.ndarray) -> np.ndarray:
+    """Returns the poses `[N, nq]` of the reference at `phase [N]` (control frames)."""
+    at = jax.vmap(lambda one: motion.sample(made.character.layout, made.motion, one)[0])
+    return np.asarray(jit(at)(phase.astype(np.float32)))
+
+
+def _com_height(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Returns the height of the centre of mass `[N]` in m for poses `[N, nq]`."""
+    data, heights = mujoco.MjData(model), []
+    for pose in qpos:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        heights.append(data.subtree_com[0, 2])
+    return np.array(heights)
