@@ -79,7 +79,9 @@ def physics_only(
     """Returns `horizon` physics steps of all environments towards where they are, and the states."""
     backend = physics.default_backend() if config.backend == "auto" else config.backend
     engine = physics.make(backend, config.env.substeps, num_envs=config.envs)
-    model = engine.load([character_lib.compile(made.character, CONTROL_DT / config.env.substeps)])
+    timestep = CONTROL_DT / config.env.substeps
+    integrator = physics.INTEGRATORS[backend]
+    model = engine.load([character_lib.compile(made.character, timestep, integrator)])
     ctrl = jnp.zeros((config.envs, made.env.action_size))
     variant = jnp.zeros(config.envs, jnp.int32)
 

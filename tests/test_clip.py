@@ -22,7 +22,7 @@ RIGHT_LEG = (
 )
 
 
-def frame(duration: float = 0.1, **columns: list[float]) -> list[float]:
+def frame(duration: float = 0.1, **columns: list) -> list[float]:
     """One DeepMimic frame of 44 numbers, upright at 0.9 m; `c8=[...]` overwrites from column 8."""
     row = [duration, 0.0, 0.9, 0.0, *UPRIGHT, *UPRIGHT, *UPRIGHT]
     for _ in range(2):

@@ -216,7 +216,12 @@ def test_only_the_character_has_a_ghost(gl, walker, tmp_path):
 
 def test_reach_and_stature(walker):
     qpos = walker.model.qpos0.copy()
-    assert stage.stature(walker.model) == pytest.approx(0.98 + 0.6)
+    assert stage.stature(walker.model, FORWARD) == pytest.approx(0.98 + 0.6)
+    # Its length counts, its width does not.
+    lying = mujoco.MjModel.__copy__(walker.model)
+    lying.qpos0[3:7] = np.sqrt(0.5), 0, np.sqrt(0.5), 0
+    assert stage.stature(lying, FORWARD) == pytest.approx(0.98 + 0.6)
+    assert stage.stature(lying, np.eye(3)[1]) == pytest.approx(0.4)
     assert stage.reach(walker.model, qpos, np.eye(3)[1]) == pytest.approx((-0.2, 0.2))
     qpos[7] = -np.pi / 2  # the left leg points forward
     assert stage.reach(walker.model, qpos, np.eye(3)[0]) == pytest.approx((-0.1, 0.98))

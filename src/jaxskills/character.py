@@ -20,6 +20,11 @@ from jaxskills.paths import data_dir
 # FS and SB simulate finer; this is the coarsest step whose skills also stand at 600 Hz.
 DEFAULT_TIMESTEP = 1.0 / 120.0
 
+INTEGRATORS = {
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+
 # Servo gains of a joint that no file names, per kg of the whole character: kp in Nm/rad, kd = kp/10.
 _KP_PER_KG = 10.0
 
@@ -136,21 +141,32 @@ def load(name: str) -> Character:
     return dataclasses.replace(character, model=compile(character, DEFAULT_TIMESTEP))
 
 
-def compile(character: Character, timestep: float) -> mujoco.MjModel:  # noqa: A001
+def compile(  # noqa: A001
+    character: Character, timestep: float, integrator: str = "discrete"
+) -> mujoco.MjModel:
     """Returns the model with one position servo per actuated degree of freedom.
 
-    The servo is stable PD a little more implicit: with `implicitfast`, kv = kd + h kp has the right
-    hand side of Tan et al. 2011. Torques are limited by the set point (see `physics.servo`), since a
-    clamped actuator loses its implicit damping and makes light links blow up.
+    `discrete` is implicit in positions and velocities, and solves contacts with the same implicit
+    mass. `implicitfast`, for engines without it, gets kv = kd + h kp, which has the right hand side
+    of stable PD (Tan et al. 2011), but solves contacts as if there were no servos: at 120 Hz the feet
+    slip at 0.4 m/s and learning stalls. Torques are limited by the set point (see `physics.servo`),
+    since a clamped actuator loses its implicit damping and makes light links blow up.
 
     Args:
       character: what to compile.
       timestep: h in s.
+      integrator: one of `INTEGRATORS`.
+
+    Raises:
+      UserError: unknown integrator.
     """
+    if integrator not in INTEGRATORS:
+        raise unknown("integrator", integrator, INTEGRATORS)
     spec = _bare_spec(Path(character.source))
     spec.option.timestep = timestep
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.integrator = INTEGRATORS[integrator]
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    fold = timestep if integrator == "implicitfast" else 0.0
     servos = zip(character.kp, character.kd, strict=True)
     names = [joint.name for joint in character.layout.joints for _ in joint.dofs]
     axes = [axis for joint in character.layout.joints for axis in range(len(joint.dofs))]
@@ -159,7 +175,7 @@ def compile(character: Character, timestep: float) -> mujoco.MjModel:  # noqa: A
         gear[axes[dof]] = 1.0
         servo = spec.add_actuator(name=f"{names[dof]}_{axes[dof]}", target=names[dof], gear=gear)
         servo.trntype = mujoco.mjtTrn.mjTRN_JOINT
-        servo.set_to_position(kp=kp, kv=kd + timestep * kp)
+        servo.set_to_position(kp=kp, kv=kd + fold * kp)
     return spec.compile()
 
 

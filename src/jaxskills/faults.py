@@ -90,7 +90,7 @@ def _world(character: Character, clip: Clip, mapping: Mapping) -> list[Finding]:
         return []
     enough = 0.35 * given.floor if plausible else max(0.12, min(0.2, 0.35 * given.floor))
     stands = f"the root is at {given.height:.3g} times the standing height of {character.name}"
-    for guesses in (_one_cause(clip), _two_causes(clip)):
+    for guesses in (_one_cause(clip), () if plausible else _two_causes(clip)):
         better = []
         for causes, repaired in guesses:
             seen = measures.world(character, repaired, mapping)

@@ -90,7 +90,8 @@ def environment(
     backend = physics_lib.default_backend() if config.backend == "auto" else config.backend
     engine = physics_lib.make(backend, config.env.substeps, num_envs=envs)
     timestep = CONTROL_DT / config.env.substeps
-    model = engine.load([character_lib.compile(character, timestep)])
+    integrator = physics_lib.INTEGRATORS[backend]
+    model = engine.load([character_lib.compile(character, timestep, integrator)])
     bounds = bounds_lib.make(character, config.bounds)
     return core.make(character, motion, engine, model, bounds, config.env)
 

@@ -19,6 +19,7 @@ from jaxskills.physics.cpu import usable_cores
 
 __all__ = [
     "BACKENDS",
+    "INTEGRATORS",
     "Physics",
     "SimState",
     "configure_cpu",
@@ -28,6 +29,9 @@ __all__ = [
 ]
 
 BACKENDS = ("cpu", "mjx", "warp")
+
+# Servos need an integrator that is implicit in contacts too (see `character.compile`); XLA has none.
+INTEGRATORS = {"cpu": "discrete", "mjx": "implicitfast", "warp": "discrete"}
 
 POOL = 8
 """Threads that XLA's CPU pool needs for MJX."""

@@ -27,6 +27,8 @@ from jaxskills.physics.base import Physics, SimState, admit, check, settle, star
 with contextlib.redirect_stdout(io.StringIO()):  # it prints where warp-lang is missing
     from mujoco import mjx
 
+    from jaxskills.physics import box_floor
+
 OVERFLOW = 0b11111
 """Warp's overflow bits that mean lost contacts or constraint rows (`OverflowType`, NEFC to CCD)."""
 
@@ -148,7 +150,8 @@ def _advance(world: tuple[mjx.Model, mjx.Data], state: SimState, ctrl: Any, subs
     def substep(_, carry):
         qpos, qvel, warmstart = carry
         data = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
-        data = mjx.step(model, data)
+        with box_floor.installed():
+            data = mjx.step(model, data)
         return data.qpos, data.qvel, data.qacc_warmstart
 
     end = jax.lax.fori_loop(0, substeps, substep, (state.qpos, state.qvel, state.engine))

@@ -84,7 +84,7 @@ def opened(
       UserError: this machine cannot render (see `opengl.backend`).
     """
     solid, ghost = _solid(model, forward), _ghost(model)
-    body = stature(model)
+    body = stature(model, forward)
     look = solid.vis
     look.global_.offwidth, look.global_.offheight, look.global_.fovy = width, height, lens.fovy
     # Without a graphics card corners cost most: these look round enough and take half the time.
@@ -141,9 +141,12 @@ def picture(
     return np.ascontiguousarray(pixels[::-1])
 
 
-def stature(model: mujoco.MjModel) -> float:
-    """Returns the height or length in m of the character at its zero pose, whichever is larger."""
-    low, high = np.array([reach(model, model.qpos0, axis) for axis in np.eye(3)]).T
+def stature(model: mujoco.MjModel, forward: np.ndarray) -> float:
+    """Returns the height or length in m of the character at its zero pose, whichever is larger.
+
+    Its width does not count: many robots start with their arms stretched out.
+    """
+    low, high = np.array([reach(model, model.qpos0, axis) for axis in (UP, forward)]).T
     return float((high - low).max())
 
 
@@ -182,7 +185,7 @@ def _solid(model: mujoco.MjModel, forward: np.ndarray) -> mujoco.MjModel:
     side = (data.geom_xpos - root) @ np.cross(UP, forward)
     material = model.geom_matid
     colour = np.where((material < 0)[:, None], model.geom_rgba, _of(model.mat_rgba, material))
-    tolerance, body = 0.01 * stature(model), _character(model)
+    tolerance, body = 0.01 * stature(model, forward), _character(model)
     left, right = body & (side > tolerance), body & (side < -tolerance)
     if {*map(tuple, colour[left])} == {*map(tuple, colour[right])}:
         copied.geom_matid[body] = -1

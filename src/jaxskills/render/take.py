@@ -63,7 +63,7 @@ def checked(
     if end == 0:
         raise UserError("nothing to film: the first pose is not finite")
     qpos, reference = qpos[:end], None if reference is None else reference[:end]
-    body = stage.stature(character.model)
+    body = stage.stature(character.model, character.forward)
     heading = _heading(character, qpos if reference is None else reference, body)
     return Take(character, qpos, reference, tuple(labels[:end]), fps, heading, body)
 

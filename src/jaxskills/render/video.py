@@ -19,7 +19,8 @@ _GIF_FPS = 15.0  # more makes the file larger, not better
 _GIF_COLOURS = 128
 
 # From the front right and a little above: degrees from the direction of travel, degrees, statures.
-_AZIMUTH, _ELEVATION, _DISTANCE, _FOVY = 130.0, -10.0, 3.5, 30.0
+_AZIMUTH, _ELEVATION, _DISTANCE, _FOVY = 130.0, -10.0, 3.6, 30.0
+_BELOW_ROOT = 0.07  # statures; legs come nearer to the camera than heads
 
 
 def write_mp4(path: Path, take: Take, size: tuple[int, int], overlay: bool) -> None:
@@ -82,10 +83,10 @@ def frames(
       overlay: draw the ghost where the reference is, not beside the simulation.
       step: leave out all poses but every `step`-th.
     """
-    ghost, middle = take.reference, take.qpos
+    ghost, middle = take.reference, take.qpos.copy()
+    middle[:, 2] -= _BELOW_ROOT * take.body
     if ghost is not None and not overlay:
         ghost = beside(take, ghost)
-        middle = middle.copy()
         middle[:, :2] = (middle[:, :2] + ghost[:, :2]) / 2
     points = lookat(take, middle)
     azimuth = np.degrees(take.heading) + _AZIMUTH
