@@ -76,7 +76,7 @@ def parts(config: trainer.TrainConfig) -> dict[str, Callable[[], Any]]:
 def physics_only(
     config: trainer.TrainConfig, made: trainer.Trainer, state: trainer.TrainState
 ) -> tuple[Callable[[Any], Any], Any]:
-    """Returns `horizon` physics steps of all environments towards where they are, and the states."""
+    """Returns `horizon` physics steps of all environments under zero controls, and the states."""
     backend = physics.default_backend() if config.backend == "auto" else config.backend
     engine = physics.make(backend, config.env.substeps, num_envs=config.envs)
     timestep = CONTROL_DT / config.env.substeps
@@ -107,7 +107,7 @@ def seconds(call: Callable[[], Any], repeats: int) -> list[float]:
 
 def main() -> None:
     """Times and prints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--clip", default="walk")
     parser.add_argument("--envs", type=int, default=trainer.TrainConfig().envs)
     parser.add_argument("--horizon", type=int, default=trainer.TrainConfig().horizon)

@@ -68,9 +68,7 @@ def test_bodies_agree_with_the_c_engine(name, tmp_path):
         )
         velocity = np.zeros((model.nbody - 1, 6))
         for i in range(1, model.nbody):
-            mujoco.mj_objectVelocity(
-                model, data, mujoco.mjtObj.mjOBJ_XBODY, i, velocity[i - 1], 0
-            )
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, i, velocity[i - 1], 0)
         close = lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5)  # noqa: E731
         close(ours.pos, data.xpos[1:])
         close(ours.rot, data.xmat[1:].reshape(-1, 3, 3))

@@ -25,7 +25,7 @@ INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
 
-# Servo gains of a joint that no file names, per kg of the whole character: kp in Nm/rad, kd = kp/10.
+# Gains of a joint that no file names, per kg of the whole character: kp in Nm/rad, kd = kp/10.
 _KP_PER_KG = 10.0
 
 _TOML_KEYS = ("forward", "end_effectors", "ground", "gains", "limits")
@@ -146,9 +146,9 @@ def compile(  # noqa: A001
 ) -> mujoco.MjModel:
     """Returns the model with one position servo per actuated degree of freedom.
 
-    `discrete` is implicit in positions and velocities, and solves contacts with the same implicit
+    `discrete` is implicit in positions and velocities and solves contacts with the same implicit
     mass. `implicitfast`, for engines without it, gets kv = kd + h kp, which has the right hand side
-    of stable PD (Tan et al. 2011), but solves contacts as if there were no servos: at 120 Hz the feet
+    of stable PD (Tan et al. 2011), but solves contacts as if there were no servos: at 120 Hz feet
     slip at 0.4 m/s and learning stalls. Torques are limited by the set point (see `physics.servo`),
     since a clamped actuator loses its implicit damping and makes light links blow up.
 
@@ -221,7 +221,9 @@ def _settings(path: Path, model: mujoco.MjModel, layout: pose.Layout) -> dict:
         "end_effectors": raw.get("end_effectors", [names[i] for i in leaves]),
         "ground": raw.get("ground", [names[i] for i in lowest]),
         "gains": {
-            name: _gains(path, name, raw["gains"][name]) if name in raw.get("gains", {}) else default
+            name: _gains(path, name, raw["gains"][name])
+            if name in raw.get("gains", {})
+            else default
             for name in movable
         },
         "limits": raw.get("limits", {}),

@@ -58,15 +58,15 @@ def restore(run: Path, trainer: Trainer) -> TrainState:
     path = (run / "checkpoints" / f"{found[-1]:012d}").absolute()
     shapes = jax.eval_shape(trainer.init, jax.random.key(0))
     here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    target = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), shapes
-    )
+    target = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), shapes)
     try:
         with ocp.StandardCheckpointer() as reader:
             return reader.restore(path, target)
     except Exception as error:  # orbax raises many kinds for missing, cut off or reshaped arrays
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        remedy = f"remove it to fall back on {found[-2]} samples" if len(found) > 1 else "train anew"
+        remedy = (
+            f"remove it to fall back on {found[-2]} samples" if len(found) > 1 else "train anew"
+        )
         raise UserError(
             f"checkpoint '{path}' is damaged or of other settings ({reason}): {remedy}"
         ) from None
@@ -96,7 +96,7 @@ def read_config(run: Path) -> TrainConfig:
 def _build(kind: Any, value: Any) -> Any:
     """Returns JSON data as the annotated type: dataclasses, tuples, mappings, unions, plain."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if dataclasses.is_dataclass(kind):
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         hints = typing.get_type_hints(kind)
         unknown = set(value) - set(hints)
         if unknown:

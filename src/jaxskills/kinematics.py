@@ -193,7 +193,7 @@ def _joint_motions(
 
 
 def momentum(params: BodyParams, bodies: Bodies) -> tuple[jax.Array, jax.Array]:
-    """Returns linear momentum `[3]` (kg m/s) and angular momentum about the CoM `[3]` (kg m^2/s)."""
+    """Returns linear `[3]` (kg m/s) and angular momentum about the CoM `[3]` (kg m^2/s)."""
     center, velocity, axes, spin = _centers(params, bodies)
     linear = jnp.sum(params.mass) * bodies.com_vel
     orbital = rotation.cross(center - bodies.com, params.mass[:, None] * velocity)

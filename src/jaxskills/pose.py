@@ -117,7 +117,9 @@ def lerp(layout: Layout, a: jax.Array, b: jax.Array, t: jax.Array) -> jax.Array:
 def normalize(layout: Layout, qpos: jax.Array) -> jax.Array:
     """Returns `qpos [..., nq]` with its quaternions at unit norm."""
     quat_q, _, other_q, _ = _addresses(layout)
-    return _merge((rotation.normalize(_gather(qpos, quat_q)), qpos[..., other_q]), (quat_q, other_q))
+    return _merge(
+        (rotation.normalize(_gather(qpos, quat_q)), qpos[..., other_q]), (quat_q, other_q)
+    )
 
 
 def rotation_vectors(layout: Layout, qpos: jax.Array) -> jax.Array:

@@ -64,7 +64,9 @@ def exp(v: jax.Array) -> jax.Array:
     small = square < _SMALL
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
     scale = jnp.where(small, 0.5 - square / 48.0, jnp.sin(0.5 * angle) / angle)
-    return jnp.concatenate((jnp.where(small, 1.0 - square / 8.0, jnp.cos(0.5 * angle)), scale * v), -1)
+    return jnp.concatenate(
+        (jnp.where(small, 1.0 - square / 8.0, jnp.cos(0.5 * angle)), scale * v), -1
+    )
 
 
 def log(q: jax.Array) -> jax.Array:

@@ -134,7 +134,9 @@ class _Judge:
             found = {name: (found[name] + again[name]) / 2 for name in found}
         now = time.monotonic()
         self._due = now + (now - begin) / _EVALUATION_SHARE
-        return {name: found[name] for name in ("success_rate", "seconds_mean", "inside_seconds_mean")}
+        return {
+            name: found[name] for name in ("success_rate", "seconds_mean", "inside_seconds_mean")
+        }
 
     def _evaluate(self, state: TrainState) -> dict[str, float]:
         self._seed += 1

@@ -40,7 +40,7 @@ class TrainConfig:
     backend: Literal["auto", "cpu", "mjx", "warp"] = "auto"
     seed: int = 0
     samples: int = 10_000_000  # at most; training stops before when the skill is learnt
-    envs: int = 256
+    envs: int = 128
     stop_when_learnt: bool = True  # 20 s without a fall in 95 % of episodes, SB Table 1
     horizon: int = 16  # control steps of each environment in an update
     env: core.EnvConfig = core.EnvConfig()
@@ -64,7 +64,7 @@ class TrainState:
 
 
 class Trainer(NamedTuple):
-    """A run's parts. `init` and `update` are pure and may be jitted, vmapped over seeds, scanned."""
+    """A run's parts. `init` and `update` are pure: jit them, scan them."""
 
     config: TrainConfig
     character: Character

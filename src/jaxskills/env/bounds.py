@@ -114,9 +114,7 @@ def errors(
     return jnp.concatenate((com, root, jnp.stack(joints), distance))
 
 
-def heading_effectors(
-    bodies: Bodies, indices: tuple[int, ...], axis: jax.Array
-) -> jax.Array:
+def heading_effectors(bodies: Bodies, indices: tuple[int, ...], axis: jax.Array) -> jax.Array:
     """Returns the end effectors `[E, 3]` seen from the ground under the root, along its heading."""
     frame = rotation.heading(bodies.rot[0], axis)
     origin = bodies.pos[0] * jnp.array([1.0, 1.0, 0.0])

@@ -190,9 +190,7 @@ def make(
         dphase = jnp.float32(1.0)
         state = EnvState(sim, state.phase + dphase, state.step + 1, state.variant)
         seen = look(state)
-        errors = bounds_lib.errors(
-            layout, seen.offset, seen.bodies, seen.reference, seen.effectors
-        )
+        errors = bounds_lib.errors(layout, seen.offset, seen.bodies, seen.reference, seen.effectors)
         sizes = bounds_lib.sizes(bounds, state.phase, motion.length)
         clear = ground.clearance(shapes, seen.bodies)
         fallen = jnp.any(clear[no_touch] <= 0.0)

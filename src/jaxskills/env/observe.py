@@ -50,4 +50,3 @@ def features(
         offset[6:],
     )
     return jnp.concatenate([part.reshape(-1) for part in parts])
-

@@ -49,8 +49,10 @@ def imitation(
       bodies: the simulated bodies.
       reference: the reference's.
     """
-    weighted = lambda d: (  # noqa: E731
-        weights.root_weight * jnp.sum(d[3:6] ** 2) + jnp.sum(weights.dof_weight * d[6:] ** 2)
+    weighted = (
+        lambda d: (  # noqa: E731
+            weights.root_weight * jnp.sum(d[3:6] ** 2) + jnp.sum(weights.dof_weight * d[6:] ** 2)
+        )
     )
     error = {
         "pose": weighted(offset),

@@ -20,32 +20,22 @@ class NetworkConfig:
 
     policy: tuple[int, ...] = (512, 256)  # hidden units; SB 4.2: 1024, 512
     value: tuple[int, ...] = (512, 256)
-    skip: bool = True  # a linear map from what the policy sees to its action, beside the layers
     noise: float = 0.05  # rad, fixed standard deviation of the action; the authors: 0.1
 
 
 class MLP(nn.Module):
-    """A multilayer perceptron with ReLU; `final_scale` 0.01 starts it near zero.
-
-    With `skip` a linear map of the input is added, zero at first: balance is feedback that is nearly
-    linear in the errors, which random hidden units learn slowly (Srouji et al. 2018).
-    """
+    """A multilayer perceptron with ReLU; `final_scale` 0.01 starts it near zero."""
 
     hidden: tuple[int, ...]
     out: int
     final_scale: float = 1.0
-    skip: bool = False
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Returns `[..., out]` of `x [..., in]`."""
-        seen = x
         for width in self.hidden:
             x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.orthogonal(jnp.sqrt(2.0)))(x))
-        y = nn.Dense(self.out, kernel_init=nn.initializers.orthogonal(self.final_scale))(x)
-        if self.skip:
-            y += nn.Dense(self.out, use_bias=False, kernel_init=nn.initializers.zeros)(seen)
-        return y
+        return nn.Dense(self.out, kernel_init=nn.initializers.orthogonal(self.final_scale))(x)
 
 
 class Networks(NamedTuple):
@@ -68,8 +58,10 @@ def make(config: NetworkConfig, obs_size: int, action_size: int, discount: float
         if not hidden or min(hidden) < 1:
             raise UserError(f"networks.{name} is {hidden}: give positive layer sizes, like 512 256")
     if not 0 < config.noise <= 10:
-        raise UserError(f"networks.noise is {config.noise}: give a standard deviation in (0, 10] rad")
-    policy, value = MLP(config.policy, action_size, 0.01, config.skip), MLP(config.value, 1, 0.01)
+        raise UserError(
+            f"networks.noise is {config.noise}: give a standard deviation in (0, 10] rad"
+        )
+    policy, value = MLP(config.policy, action_size, 0.01), MLP(config.value, 1, 0.01)
     largest = 1.0 / (1.0 - discount)
 
     def init(key: jax.Array) -> tuple[Params, Params]:

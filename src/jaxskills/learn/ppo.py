@@ -21,13 +21,13 @@ class PPOConfig:
     discount: float = 0.98  # per control frame; SB section 5: 0.95
     lambda_: float = 0.95  # SB section 5, for GAE and TD alike
     clip: float = 0.2
-    epochs: int = 4
+    epochs: int = 3
     minibatch: int = 512  # SB section 5: 256
-    policy_lr: float = 3e-5  # Adam, to begin with
+    policy_lr: float = 5e-5  # Adam, to begin with
     value_lr: float = 1e-3  # Adam
-    # The policy's step size follows the change it makes: down by a half where an update moves the
+    # The policy's step size follows the change it makes: down by a third where an update moves the
     # policy by more than twice this, up where by less than half of it. 0 keeps it as it is.
-    target_kl: float = 0.015
+    target_kl: float = 0.03
     max_grad_norm: float = 10.0
 
 
@@ -123,7 +123,7 @@ def update(
     rows = order[:, : count * config.minibatch].reshape(-1, config.minibatch)
     learner, watched = jax.lax.scan(minibatch_step, learner, rows)
     lr = next_lr(config, learner.policy_lr, jnp.mean(watched["kl"][-count:]))
-    return learner.replace(policy_lr=lr), jax.tree.map(jnp.mean, watched) | {"policy_lr": lr}
+    return dataclasses.replace(learner, policy_lr=lr), jax.tree.map(jnp.mean, watched) | {"policy_lr": lr}
 
 
 def next_lr(config: PPOConfig, lr: jax.Array, kl: jax.Array) -> jax.Array:

@@ -30,7 +30,7 @@ __all__ = [
 
 BACKENDS = ("cpu", "mjx", "warp")
 
-# Servos need an integrator that is implicit in contacts too (see `character.compile`); XLA has none.
+# Servos want an integrator that is implicit in contacts too (see `character.compile`).
 INTEGRATORS = {"cpu": "discrete", "mjx": "implicitfast", "warp": "discrete"}
 
 POOL = 8
