@@ -4,7 +4,7 @@
 import ast
 import importlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -12,7 +12,7 @@ import pytest
 import jaxskills
 
 # A module imports only from modules above it. A folder's `__init__` is its last line.
-ORDER: list[str] = """
+ORDER: Sequence[str] = """
 errors paths compilation
 
 rotation pose

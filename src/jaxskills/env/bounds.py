@@ -73,7 +73,7 @@ def make(character: Character, config: BoundsConfig) -> Bounds:
         by_name[name] = size
     tables = {name: np.atleast_1d(np.asarray(size, float)) for name, size in by_name.items()}
     for name, table in tables.items():
-        if table.ndim != 1 or not (table > 0).all():
+        if table.ndim != 1 or not table.size or not (table > 0).all():
             raise UserError(f"bound {name} is {by_name[name]}: give positive sizes (m or rad)")
     knots = max(len(table) for table in tables.values())
     columns = [_spread(table, knots) for table in tables.values()]

@@ -49,11 +49,11 @@ def imitation(
       bodies: the simulated bodies.
       reference: the reference's.
     """
-    weighted = (
-        lambda d: (  # noqa: E731
-            weights.root_weight * jnp.sum(d[3:6] ** 2) + jnp.sum(weights.dof_weight * d[6:] ** 2)
-        )
-    )
+
+    def weighted(d: jax.Array) -> jax.Array:
+        root, joints = jnp.sum(d[3:6] ** 2), jnp.sum(weights.dof_weight * d[6:] ** 2)
+        return weights.root_weight * root + joints
+
     error = {
         "pose": weighted(offset),
         "velocity": weighted(velocity_error),

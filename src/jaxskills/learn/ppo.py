@@ -123,7 +123,8 @@ def update(
     rows = order[:, : count * config.minibatch].reshape(-1, config.minibatch)
     learner, watched = jax.lax.scan(minibatch_step, learner, rows)
     lr = next_lr(config, learner.policy_lr, jnp.mean(watched["kl"][-count:]))
-    return dataclasses.replace(learner, policy_lr=lr), jax.tree.map(jnp.mean, watched) | {"policy_lr": lr}
+    learner = dataclasses.replace(learner, policy_lr=lr)
+    return learner, jax.tree.map(jnp.mean, watched) | {"policy_lr": lr}
 
 
 def next_lr(config: PPOConfig, lr: jax.Array, kl: jax.Array) -> jax.Array:

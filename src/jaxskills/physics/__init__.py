@@ -31,7 +31,7 @@ __all__ = [
 BACKENDS = ("cpu", "mjx", "warp")
 
 # Servos want an integrator that is implicit in contacts too (see `character.compile`).
-INTEGRATORS = {"cpu": "discrete", "mjx": "implicitfast", "warp": "discrete"}
+INTEGRATORS = {"cpu": "discrete", "mjx": "discrete", "warp": "discrete"}
 
 POOL = 8
 """Threads that XLA's CPU pool needs for MJX."""

@@ -22,6 +22,7 @@ import numpy as np
 from mujoco import batch
 
 from jaxskills.errors import UserError
+from jaxskills.physics import explicit
 from jaxskills.physics.base import Physics, SimState, admit, check, settle, start
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints where warp-lang is missing
@@ -62,7 +63,7 @@ def load(models: Sequence[mujoco.MjModel], impl: str, num_envs: int) -> MjxModel
     check(models)
     sizes = capacity(models, num_envs) if impl == "warp" else {}
     try:
-        worlds = [_put(_without_autoreset_flag(model), impl, sizes) for model in models]
+        worlds = [_put(_prepare(model, impl), impl, sizes) for model in models]
     except NotImplementedError as error:
         raise UserError(f"backend with impl '{impl}' cannot run this model: {error}") from None
     leaves = [jax.tree.leaves(world) for world in worlds]
@@ -93,8 +94,13 @@ def _put(model: mujoco.MjModel, impl: str, sizes: dict[str, Any]) -> tuple[Any, 
     return placed, mjx.make_data(model, impl=impl, **sizes)
 
 
-def _without_autoreset_flag(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns a copy without the flag that turns the reset of C MuJoCo off: Warp refuses it."""
+def _prepare(model: mujoco.MjModel, impl: str) -> mujoco.MjModel:
+    """Returns a copy that MJX accepts.
+
+    Warp refuses the flag that turns the reset of C MuJoCo off; `impl='jax'` has no `discrete`.
+    """
+    if impl == "jax" and model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE:
+        model = explicit.from_discrete(model)
     model = copy.copy(model)
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     return model
