@@ -80,8 +80,7 @@ def physics_only(
     backend = physics.default_backend() if config.backend == "auto" else config.backend
     engine = physics.make(backend, config.env.substeps, num_envs=config.envs)
     timestep = CONTROL_DT / config.env.substeps
-    integrator = physics.INTEGRATORS[backend]
-    model = engine.load([character_lib.compile(made.character, timestep, integrator)])
+    model = engine.load([character_lib.compile(made.character, timestep)])
     ctrl = jnp.zeros((config.envs, made.env.action_size))
     variant = jnp.zeros(config.envs, jnp.int32)
 

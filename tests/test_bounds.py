@@ -56,7 +56,7 @@ def _moved(who: Character, start: np.ndarray, **by_dof: float) -> np.ndarray:
 
 
 def _sizes(made: bounds.Bounds, phase: float, length: float = 30.0) -> np.ndarray:
-    return np.asarray(bounds.sizes(made, jnp.float32(phase), jnp.float32(length)))
+    return np.asarray(bounds.sizes(made, jnp.float32(phase % length / length)))
 
 
 def test_channels_are_in_order(who: Character):

@@ -218,6 +218,13 @@ def test_evaluate_prints_one_json_object(finished: Path, capfd: Capture):
     assert digest(finished) == before
 
 
+def test_plot_writes_a_picture(finished: Path, tmp_path: Path, capsys: Capture):
+    file = tmp_path / "new" / "walk.svg"
+    assert main(["plot", str(finished), "--out", str(file)]) == 0
+    assert f"wrote {file}" in capsys.readouterr().out
+    assert file.read_text().startswith("<?xml")
+
+
 def test_a_run_is_not_overwritten(finished: Path, walker: list[str], capsys: Capture):
     before = digest(finished)
     assert "--resume" in refused(capsys, *walker, "--out", finished)

@@ -208,6 +208,6 @@ def test_what_is_out_of_range_is_refused(changes: dict, message: str):
 
 
 def test_lambda_may_be_1_but_no_more():
-    ppo.validate(PPOConfig(lambda_=1.0), 256)
+    ppo.validate(PPOConfig(lambda_=1.0), 4096)
     with pytest.raises(UserError, match=r"ppo\.lambda_ is 1\.5: give 0 <= lambda_ <= 1"):
-        ppo.validate(PPOConfig(lambda_=1.5), 256)
+        ppo.validate(PPOConfig(lambda_=1.5), 4096)

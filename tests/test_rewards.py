@@ -31,13 +31,14 @@ def _reward(
     for row, pairs in zip(rows, (offset, velocity), strict=True):
         for index, value in pairs:
             row[index] = value
-    here = jnp.ones((3, 3))
+    off = jnp.array(effectors, float).reshape(-1, 3)
+    here = jnp.ones_like(off)
     return float(
         rewards.imitation(
             rewards.imitation_weights(who),
             jnp.asarray(rows[0]),
             jnp.asarray(rows[1]),
-            (here, here + jnp.array(effectors)),
+            (here, here + off),
             _bodies((1.0, 2.0, 3.0)),
             _bodies(np.add((1.0, 2.0, 3.0), com)),
         )
@@ -81,6 +82,10 @@ def test_one_by_hand(who: Character):
 )
 def test_each_term_alone_lost_costs_its_weight(who: Character, name: str, errors: dict):
     assert _reward(who, **errors) == pytest.approx(1.0 - rewards.TERMS[name], abs=1e-5)
+
+
+def test_a_character_without_end_effectors_has_a_reward_too(who: Character):
+    assert _reward(who, effectors=()) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_where_the_root_is_costs_nothing_by_itself(who: Character):

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A walker of four bodies and its walk: every kind of joint, and quick to compile."""
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import numpy as np
+from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
 from jaxskills import character, clip, clip_data, motion
 from jaxskills import physics as physics_lib
@@ -139,3 +143,25 @@ def train_config(folder: Path, **changes) -> TrainConfig:
         "ppo": PPOConfig(epochs=2, minibatch=16),
     }
     return TrainConfig(**(settings | changes))
+
+
+@contextlib.contextmanager
+def compilation_cache(folder: Path) -> Iterator[Path]:
+    """Keeps compiled programs in `folder` meanwhile, for tests that compile the same one again."""
+    settings = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": 0,
+    }
+    before = {name: getattr(jax.config, name) for name in settings}
+    _configure(settings)
+    try:
+        yield folder
+    finally:
+        _configure(before)
+
+
+def _configure(settings: dict) -> None:
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    jax_cache.reset_cache()

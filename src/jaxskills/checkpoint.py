@@ -9,6 +9,7 @@ import json
 import shutil
 import types
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,8 @@ def _build(kind: Any, value: Any) -> Any:
     """Returns JSON data as the annotated type: dataclasses, tuples, mappings, unions, plain."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise ValueError(f"{kind.__name__} is not an object")
         hints = typing.get_type_hints(kind)
         unknown = set(value) - set(hints)
         if unknown:
@@ -107,4 +110,6 @@ def _build(kind: Any, value: Any) -> Any:
         return tuple(value) if isinstance(value, list) else (value if plain else None)
     if origin is tuple:
         return tuple(value)
+    if origin is Mapping:
+        return {name: _build(arguments[1], item) for name, item in value.items()}
     return value

@@ -130,7 +130,7 @@ def evaluate(command: arguments.Evaluate) -> Answer:
     trace = playback.play(made, state, config)
     data = {
         **evaluate_lib.summary(trace),
-        "samples": train_lib.samples_of(made.config, state),
+        "samples": int(state.samples),
         **dataclasses.asdict(config),
         "substeps": config.substeps or made.config.env.substeps,
     }

@@ -61,7 +61,7 @@ def make(trainer: Trainer, config: EvaluateConfig) -> Callable[[TrainState, jax.
         trainer.config.env,
         stop="fall",
         seconds=3600.0,
-        substeps=config.substeps or trainer.config.env.substeps,
+        substeps=trainer.config.env.substeps if config.substeps is None else config.substeps,
     )
     env = trainer_lib.environment(
         dataclasses.replace(trainer.config, env=changed),

@@ -74,7 +74,7 @@ def from_qpos(
         poses = _close(model, poses, yaw, step, config.close_loop * (frames - 1) / duration)
     dt = duration / (frames - 1)
     qvel = _velocities(model, poses, dt, loop, yaw, step)
-    qvel = _smooth(qvel, config.smooth_velocity / dt, loop)
+    qvel = _smooth(qvel, config.smooth_velocity / dt, loop, yaw)
     as_array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     arrays = (poses, qvel, duration / CONTROL_DT, step, yaw)
     return Motion(*(as_array(x) for x in arrays), loop=loop)
@@ -191,7 +191,7 @@ def _velocities(
     return qvel
 
 
-def _smooth(qvel: np.ndarray, width: float, loop: bool) -> np.ndarray:
+def _smooth(qvel: np.ndarray, width: float, loop: bool, yaw: float) -> np.ndarray:
     """Returns the velocities under a Gaussian of `width` frames along time."""
     reach = int(np.ceil(3.0 * width))
     if reach == 0:
@@ -200,8 +200,13 @@ def _smooth(qvel: np.ndarray, width: float, loop: bool) -> np.ndarray:
     weights /= weights.sum()
     if loop:
         # The last frame is the first of the next cycle: leave it out, wrap, and put it back.
-        index = np.arange(-reach, len(qvel) + reach) % (len(qvel) - 1)
-        padded = qvel[index]
+        index = np.arange(-reach, len(qvel) + reach)
+        padded = qvel[index % (len(qvel) - 1)]
+        # Each cycle is turned once more than the one before.
+        turn = index // (len(qvel) - 1) * yaw
+        x, y = padded[:, 0].copy(), padded[:, 1].copy()
+        padded[:, 0] = np.cos(turn) * x - np.sin(turn) * y
+        padded[:, 1] = np.sin(turn) * x + np.cos(turn) * y
     else:
         padded = np.pad(qvel, ((reach, reach), (0, 0)), mode="edge")
     return np.stack([weights @ padded[i : i + 2 * reach + 1] for i in range(len(qvel))])

@@ -53,7 +53,7 @@ def train(
     made = trainer.make(config)
     if resume:
         state = checkpoint.restore(run, made)
-        history = _rewind(run, samples_of(config, state))
+        history = _rewind(run, int(state.samples))
     else:
         _claim(run)
         state, history = jit(made.init)(jax.random.key(config.seed)), []
@@ -61,11 +61,6 @@ def train(
     with _stop_signal() as stopped:
         state, last = _loop(made, run, state, history, report, stopped)
     return made, state, last
-
-
-def samples_of(config: TrainConfig, state: TrainState) -> int:
-    """Returns how many transitions a state has learnt from."""
-    return int(state.updates) * config.envs * config.horizon
 
 
 def _loop(
@@ -81,8 +76,10 @@ def _loop(
     judge = _Judge(made)
     before = history[-1]["wall_s"] if history else 0.0
     begin = saved = time.monotonic()
-    samples, sums, why = samples_of(config, state), [], ""
+    samples, sums, why = int(state.samples), [], ""
     last: dict[str, Any] = {"samples": samples, "wall_s": before, "survival_s": 0.0}
+    if history:
+        last = history[-1]
     with (run / "metrics.jsonl").open("a") as lines, SummaryWriter(str(run)) as board:
         while not why:
             if samples >= config.samples:
@@ -120,13 +117,16 @@ class _Judge:
         self.learnt = False
         self._enabled = made.config.stop_when_learnt
         self._trace = jit(evaluate.make(made, evaluate.EvaluateConfig()))
+        self._compiled: Any = None
         self._seed = 0
         self._due = 0.0
 
     def __call__(self, state: TrainState, survival: float) -> dict[str, float]:
-        begin = time.monotonic()
-        if begin < self._due or survival < _PROMISING_SECONDS or not self._enabled:
+        if time.monotonic() < self._due or survival < _PROMISING_SECONDS or not self._enabled:
             return {}
+        if self._compiled is None:
+            self._compiled = self._trace.lower(state, jax.random.key(0)).compile()
+        begin = time.monotonic()  # what compiling takes must not put off the next evaluation
         found = self._evaluate(state)
         if found["success_rate"] >= evaluate.SUCCESS_RATE:
             again = self._evaluate(state)
@@ -140,7 +140,7 @@ class _Judge:
 
     def _evaluate(self, state: TrainState) -> dict[str, float]:
         self._seed += 1
-        return evaluate.summary(self._trace(state, jax.random.key(self._seed)))
+        return evaluate.summary(self._compiled(state, jax.random.key(self._seed)))
 
 
 def line(

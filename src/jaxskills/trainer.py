@@ -61,6 +61,7 @@ class TrainState:
     current: rollout.Fresh  # the B environments and what they show
     key: jax.Array  # root of all randomness; the number of updates is folded in
     updates: jax.Array  # [] int32
+    samples: jax.Array  # [] uint32, transitions learnt from
 
 
 class Trainer(NamedTuple):
@@ -90,8 +91,7 @@ def environment(
     backend = physics_lib.default_backend() if config.backend == "auto" else config.backend
     engine = physics_lib.make(backend, config.env.substeps, num_envs=envs)
     timestep = CONTROL_DT / config.env.substeps
-    integrator = physics_lib.INTEGRATORS[backend]
-    model = engine.load([character_lib.compile(character, timestep, integrator)])
+    model = engine.load([character_lib.compile(character, timestep)])
     bounds = bounds_lib.make(character, config.bounds)
     return core.make(character, motion, engine, model, bounds, config.env)
 
@@ -116,7 +116,7 @@ def make(config: TrainConfig) -> Trainer:
         current = rollout.begin(env, phase)
         normalizer = normalize.update(normalize.init(obs_size), current.obs)
         learner = ppo_lib.init(config.ppo, nets, learner_key)
-        return TrainState(learner, normalizer, starts, current, key, jnp.int32(0))
+        return TrainState(learner, normalizer, starts, current, key, jnp.int32(0), jnp.uint32(0))
 
     def update(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(state.key, state.updates)
@@ -146,6 +146,7 @@ def make(config: TrainConfig) -> Trainer:
             current,
             state.key,
             state.updates + 1,
+            state.samples + jnp.uint32(config.envs * config.horizon),
         )
         return new_state, metrics
 

@@ -81,12 +81,12 @@ def make(character: Character, config: BoundsConfig) -> Bounds:
     return Bounds(jnp.asarray(np.stack(columns, 1), jnp.float32), names, forbidden)
 
 
-def sizes(bounds: Bounds, phase: jax.Array, length: jax.Array) -> jax.Array:
-    """Returns the sizes `[K]` at `phase []` of a motion of `length []`, linear between knots."""
+def sizes(bounds: Bounds, share: jax.Array) -> jax.Array:
+    """Returns the sizes `[K]` at a `share []` of the cycle, linear between knots, held after 1."""
     knots = bounds.sizes.shape[0]
     if knots == 1:
         return bounds.sizes[0]
-    place = (phase % length) / length * (knots - 1)
+    place = jnp.clip(share, 0.0, 1.0) * (knots - 1)
     low = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, knots - 2)
     return bounds.sizes[low] + (place - low) * (bounds.sizes[low + 1] - bounds.sizes[low])
 
@@ -118,7 +118,7 @@ def heading_effectors(bodies: Bodies, indices: tuple[int, ...], axis: jax.Array)
     """Returns the end effectors `[E, 3]` seen from the ground under the root, along its heading."""
     frame = rotation.heading(bodies.rot[0], axis)
     origin = bodies.pos[0] * jnp.array([1.0, 1.0, 0.0])
-    return rotation.turn_back(frame, bodies.pos[np.array(indices)] - origin)
+    return rotation.turn_back(frame, bodies.pos[np.array(indices, int)] - origin)
 
 
 def _spread(table: np.ndarray, knots: int) -> np.ndarray:

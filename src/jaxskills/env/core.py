@@ -131,7 +131,7 @@ def make(
     lateral = np.cross([0.0, 0.0, 1.0], forward)
     axis = jnp.asarray(forward if config.heading == "forward" else lateral, jnp.float32)
     allowed = {character.body(name) for name in character.ground}
-    no_touch = np.array([i for i in range(len(character.body_names)) if i not in allowed])
+    no_touch = np.array([i for i in range(len(character.body_names)) if i not in allowed], int)
     forbidden = np.array(bounds.forbidden, int)
     dofs = np.array(servos.dofs)
     neutral = jnp.asarray(character.model.qpos0, jnp.float32)
@@ -191,7 +191,8 @@ def make(
         state = EnvState(sim, state.phase + dphase, state.step + 1, state.variant)
         seen = look(state)
         errors = bounds_lib.errors(layout, seen.offset, seen.bodies, seen.reference, seen.effectors)
-        sizes = bounds_lib.sizes(bounds, state.phase, motion.length)
+        within = state.phase % motion.length if motion.loop else state.phase
+        sizes = bounds_lib.sizes(bounds, within / motion.length)
         clear = ground.clearance(shapes, seen.bodies)
         fallen = jnp.any(clear[no_touch] <= 0.0)
         touching = jnp.any(clear[forbidden] <= 0.0)

@@ -144,8 +144,9 @@ def validate(config: PPOConfig, batch_size: int) -> None:
     """
     for name in ("discount", "lambda_"):
         value = getattr(config, name)
-        if not 0 <= value < 1 and not (name == "lambda_" and value == 1):
-            raise UserError(f"ppo.{name} is {value}: give 0 <= {name} < 1")
+        if not 0 <= value <= 1 or (name == "discount" and value == 1):
+            largest = "< 1" if name == "discount" else "<= 1"
+            raise UserError(f"ppo.{name} is {value}: give 0 <= {name} {largest}")
     for name in ("clip", "policy_lr", "value_lr", "max_grad_norm"):
         if not getattr(config, name) > 0:
             raise UserError(f"ppo.{name} is {getattr(config, name)}: give a positive number")

@@ -19,7 +19,6 @@ from jaxskills.physics.cpu import usable_cores
 
 __all__ = [
     "BACKENDS",
-    "INTEGRATORS",
     "Physics",
     "SimState",
     "configure_cpu",
@@ -29,9 +28,6 @@ __all__ = [
 ]
 
 BACKENDS = ("cpu", "mjx", "warp")
-
-# Servos want an integrator that is implicit in contacts too (see `character.compile`).
-INTEGRATORS = {"cpu": "discrete", "mjx": "discrete", "warp": "discrete"}
 
 POOL = 8
 """Threads that XLA's CPU pool needs for MJX."""

@@ -79,7 +79,9 @@ def load(models: Sequence[mujoco.MjModel], impl: str, num_envs: int) -> MjxModel
         i for i, column in enumerate(columns) if any((x != column[0]).any() for x in column)
     )
     return MjxModel(
-        shared=worlds[0],
+        # MJX ties its arrays to a device. Mixed with arrays that are not, a second call of a jitted
+        # step would differ from the first in that alone, and compile again.
+        shared=jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), worlds[0]),
         varied=tuple(jnp.asarray(np.stack(columns[i])) for i in where),
         home=jnp.asarray(np.stack([m.qpos0 for m in models]), jnp.float32),
         where=where,

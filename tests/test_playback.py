@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A controller played back: what pictures and films are made of."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import tiny
+from PIL import Image
+
+from jaxskills import playback, plot, trainer
+from jaxskills.compilation import jit
+from jaxskills.errors import UserError
+from jaxskills.evaluate import EvaluateConfig, Trace
+from jaxskills.render import opengl
+from jaxskills.trainer import Trainer, TrainState
+
+
+@pytest.fixture(scope="module")
+def untrained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Trainer, TrainState]:
+    made = trainer.make(tiny.train_config(tmp_path_factory.mktemp("walker")))
+    return made, jit(made.init)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def trace(untrained: tuple[Trainer, TrainState]) -> Trace:
+    return playback.play(*untrained, EvaluateConfig(seconds=1.0, episodes=3))
+
+
+def test_states_after_a_fall_are_left_out(untrained: tuple[Trainer, TrainState], trace: Trace):
+    fallen = np.zeros((30, 3), bool)
+    fallen[10:, 0], fallen[0:, 1] = True, True
+    shown = playback.played(untrained[0], trace.replace(fallen=fallen))
+    assert len(shown.phase) == len(shown.height) == 10 + 0 + 30
+    assert {len(values) for values in shown.margins.values()} == {40}
+    assert ((shown.phase >= 0) & (shown.phase <= 1)).all()
+
+
+def test_margins(untrained: tuple[Trainer, TrainState], trace: Trace):
+    errors, sizes = np.array(trace.errors), np.asarray(trace.sizes)
+    errors[:, :, 2] = 0.25 * sizes[:, :, 2]
+    names = untrained[0].env.endings
+    shown = playback.played(
+        untrained[0], trace.replace(errors=errors, fallen=np.zeros((30, 3), bool))
+    )
+    np.testing.assert_allclose(shown.margins[names[2]], 0.75, rtol=1e-6)
+    assert set(shown.margins) == set(names[: errors.shape[2]])
+
+
+def test_first_departures_are_counted_by_bound_and_phase(
+    untrained: tuple[Trainer, TrainState], trace: Trace
+):
+    made = untrained[0]
+    errors, inside = np.zeros_like(trace.errors), np.ones((30, 3), bool)
+    inside[4:, 0] = False  # a bound
+    errors[4, 0, 1] = 1.5 * np.asarray(trace.sizes)[4, 0, 1]
+    errors[4, 0, 0] = 1.1 * np.asarray(trace.sizes)[4, 0, 0]
+    inside[7:, 2] = False  # no bound is passed: a body that may not touch the ground
+    phase = np.full((30, 3), 0.32 * made.env.length, np.float32)
+    shown = playback.played(made, trace.replace(errors=errors, inside=inside, phase=phase))
+    counted = {name: counts for name, counts in shown.endings.items() if counts.any()}
+    assert set(counted) == {made.env.endings[1], "ground contact"}
+    for counts in counted.values():
+        assert counts[6] == counts.sum() == 1  # 0.32 lies in the seventh of 20 parts
+
+
+def test_height_of_the_reference(untrained: tuple[Trainer, TrainState], trace: Trace):
+    """The walker's pelvis stays at 0.5 m; its centre of mass hardly moves."""
+    shown = playback.played(untrained[0], trace)
+    assert shown.reference_height.shape == shown.reference_phase.shape
+    # masses and heights: pelvis 3 kg, torso 2 kg, legs 1 kg each, feet 0.5 kg each
+    standing = (3 * 0.5 + 2 * (0.58 + 0.125) + 2 * (0.5 - 0.24) + 1 * (0.5 - 0.48)) / 8
+    np.testing.assert_allclose(shown.reference_height, standing, atol=0.02)
+
+
+def test_picture(untrained: tuple[Trainer, TrainState], trace: Trace, tmp_path: Path):
+    rows = [{"samples": 32 * i, "wall_s": 1.0 * i, "survival_s": 0.1 * i} for i in (1, 2)]
+    path = plot.figure(tmp_path / "walk.png", "walk", rows, playback.played(untrained[0], trace))
+    with Image.open(path) as page:
+        assert page.width > 1000
+
+
+def test_film(untrained: tuple[Trainer, TrainState], tmp_path: Path):
+    try:
+        opengl.backend()
+    except UserError as missing:
+        pytest.skip(str(missing))
+    strip = playback.film(*untrained, tmp_path / "strip.png", seconds=1.0)
+    with Image.open(strip) as drawn:
+        assert np.asarray(drawn.convert("L")).std() > 5  # something is in it
