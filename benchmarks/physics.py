@@ -22,6 +22,7 @@ import numpy as np
 from mujoco import batch, rollout
 
 from jaxskills import character, physics
+from jaxskills.compilation import jit
 
 
 def states(model: mujoco.MjModel, envs: int, steps: int) -> tuple[np.ndarray, ...]:
@@ -70,7 +71,7 @@ def jit_loop(backend: str, model, substeps: int, qpos, qvel, ctrl) -> Callable[[
     loaded = engine.load([model])
     variant = jnp.zeros(len(qpos), jnp.int32)
 
-    @jax.jit
+    @jit
     def advance(loaded, qpos, qvel, ctrl):
         state = jax.vmap(engine.init, (None, 0, 0, 0))(loaded, variant, qpos, qvel)
         step = jax.vmap(engine.step, (None, 0, 0, 0))

@@ -164,11 +164,11 @@ def test_a_fresh_process_goes_on_bit_for_bit(
     _assert_same_bits(continued, _run(update, half, 10))
 
 
-def test_two_seeds_in_one_program_are_two_runs(init, update: Update):
+def test_two_seeds_in_one_program_are_two_runs(made: Trainer, init, update: Update):
     seeds = [jax.random.key(seed) for seed in (0, 1)]
     alone = [_run(update, init(key), 2) for key in seeds]
-    together = jax.vmap(init)(jnp.stack(seeds))
-    together = _run(jit(jax.vmap(update)), together, 2)
+    together = jit(jax.vmap(made.init))(jnp.stack(seeds))
+    together = _run(jit(jax.vmap(made.update)), together, 2)
     for row, state in enumerate(alone):
         one = jax.tree.map(lambda x: x[row], together)  # noqa: B023
         for x, y in zip(_leaves(one), _leaves(state), strict=True):
