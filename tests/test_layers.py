@@ -21,7 +21,8 @@ character
 hinges posed mapping retarget measures repairs faults check
 kinematics ground motion
 
-physics.quiet physics.ffi physics.base physics.cpu physics.box_floor physics.explicit physics.mjx physics.servo physics
+physics.quiet physics.ffi physics.base physics.cpu physics.box_floor physics.explicit
+physics.mjx physics.servo physics
 env.observe env.bounds env.rewards env.core env
 learn.networks learn.normalize learn.gae learn.ppo learn.rollout learn
 explore.starts explore
