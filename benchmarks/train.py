@@ -17,19 +17,15 @@ from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any
 
-from jaxskills.physics import configure_cpu
+import jax
+import jax.numpy as jnp
 
-configure_cpu()
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-
-from jaxskills import character as character_lib  # noqa: E402
-from jaxskills import physics, trainer  # noqa: E402
-from jaxskills.compilation import jit  # noqa: E402
-from jaxskills.explore import starts as starts_lib  # noqa: E402
-from jaxskills.learn import ppo, rollout  # noqa: E402
-from jaxskills.motion import CONTROL_DT  # noqa: E402
+from jaxskills import character as character_lib
+from jaxskills import physics, trainer
+from jaxskills.compilation import jit
+from jaxskills.explore import starts as starts_lib
+from jaxskills.learn import ppo, rollout
+from jaxskills.motion import CONTROL_DT
 
 
 def parts(config: trainer.TrainConfig) -> dict[str, Callable[[], Any]]:
@@ -113,6 +109,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    physics.configure_cpu("cpu")
     config = dataclasses.replace(
         trainer.TrainConfig(clip=options.clip), envs=options.envs, horizon=options.horizon
     )

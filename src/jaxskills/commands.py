@@ -50,7 +50,7 @@ def perform(command: Any, settings: Any) -> Answer:
     Raises:
       UserError: bad input.
     """
-    physics.configure_cpu()
+    physics.configure_cpu(getattr(settings or command, "backend", "auto"))
     match command:
         case arguments.Train():
             return train(command, settings)

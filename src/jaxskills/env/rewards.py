@@ -57,7 +57,7 @@ def imitation(
     error = {
         "pose": weighted(offset),
         "velocity": weighted(velocity_error),
-        "end_effectors": jnp.mean(jnp.sum((effectors[0] - effectors[1]) ** 2, -1)),
+        "end_effectors": jnp.sum((effectors[0] - effectors[1]) ** 2) / max(len(effectors[0]), 1),
         "com": jnp.sum((bodies.com - reference.com) ** 2),
     }
     terms = [weight * jnp.exp(-SCALES[name] * error[name]) for name, weight in TERMS.items()]

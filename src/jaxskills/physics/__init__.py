@@ -64,18 +64,21 @@ def make(backend: str, substeps: int, *, num_envs: int, threads: int | None = No
     return mjx.make("warp" if backend == "warp" else "jax", substeps, num_envs)
 
 
-def configure_cpu() -> bool:
-    """Makes jax on the CPU fit for MJX and Python callbacks, if it has not used a device yet.
+def configure_cpu(backend: str = "mjx") -> bool:
+    """Makes jax on the CPU fit for a backend, if it has not used a device yet.
 
     jaxlib's batched Cholesky factorisation runs on a thread of XLA's pool and waits there for
     tasks of the same pool: on two cores, two of them wait for each other for ever (jaxlib 0.10.2).
-    So the pool gets `POOL` threads (variable NPROC). Asynchronous dispatch, which takes another
-    of them, is turned off. Returns whether the pool is large enough.
+    So for `mjx` the pool gets `POOL` threads (variable NPROC); the others, which do without that
+    factorisation, keep one thread per core, with which learning is a seventh faster. Asynchronous
+    dispatch, which takes another thread, is turned off. Returns whether the pool is large enough
+    for `mjx`.
     """
     pool = _pool_size()
     if not xla_bridge.backends_are_initialized():
         jax.config.update("jax_cpu_enable_async_dispatch", False)
-        os.environ["NPROC"] = str(max(pool, POOL))
+        if backend == "mjx":
+            os.environ["NPROC"] = str(max(pool, POOL))
     return _pool_size() >= POOL
 
 
