@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trains skills as a person would, evaluates them, and keeps what came out, failed or not.
+
+    python experiments/reproduce.py walk run --seeds 0 1 2 --runs runs
+
+For each skill and seed: `jaxskills train` with the default settings, then `jaxskills evaluate` over
+64 episodes at the physics rate of the training and at 600 Hz. One JSON file each is written to
+`experiments/results/`. A run folder that exists is resumed, so a reproduction that was cut off can
+be started again. `experiments/tables.py` prints the tables.
+"""
+
+import argparse
+import json
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from jaxskills.physics import usable_cores
+
+RESULTS = Path(__file__).parent / "results"
+SUBSTEPS_600_HZ = 20  # of a control step of 1/30 s, SB section 5
+_CURVE = 40  # points kept of a learning curve
+_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
+
+
+def reproduce(skill: str, seed: int, runs: Path) -> dict[str, Any]:
+    """Returns the record of one run, JSON-ready."""
+    run = runs / f"{Path(skill).stem}-{seed}"
+    resumed = (run / "config.json").is_file()
+    options = ["train", skill, "--seed", str(seed), "--out", str(run)]
+    print(f"{skill}, seed {seed}", file=sys.stderr)
+    code, seconds, first = train(options + ["--resume"] * resumed)
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    last = rows[-1]
+    record = {
+        "command": shlex.join(["jaxskills", *options]),
+        "skill": skill,
+        "seed": seed,
+        "exit_code": code,
+        "resumed": resumed,
+        "samples": last["samples"],
+        "wall_s": last["wall_s"],
+        "first_line_s": first,
+        "command_s": seconds,
+        **machine(),
+    }
+    for name, rate in (("evaluate", []), ("evaluate_600hz", ["--substeps", str(SUBSTEPS_600_HZ)])):
+        answer = jaxskills("evaluate", str(run), "--episodes", "64", "--json", *rate)
+        record[name] = json.loads(answer) if answer else None
+    keep = ("samples", "wall_s", "survival_s", "success_rate")
+    record["curve"] = [{k: row[k] for k in keep if k in row} for row in thinned(rows)]
+    return record
+
+
+def train(options: list[str]) -> tuple[int, float, float | None]:
+    """Returns exit code, wall seconds, and seconds until the first line of progress was shown."""
+    begin, first = time.monotonic(), None
+    command = [sys.executable, "-m", "jaxskills", *options]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr
+        for line in process.stderr:
+            if first is None and " survival " in line:
+                first = round(time.monotonic() - begin, 1)
+            print(line, end="", file=sys.stderr, flush=True)
+    return process.returncode, round(time.monotonic() - begin, 1), first
+
+
+def jaxskills(*options: str) -> str:
+    """Returns the standard output of a command, nothing if it failed."""
+    command = [sys.executable, "-m", "jaxskills", *options]
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False).stdout
+
+
+def thinned(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns evenly spaced rows, all rows with an evaluation, and the last."""
+    stride = max(1, len(rows) // _CURVE)
+    return [
+        row
+        for i, row in enumerate(rows)
+        if i % stride == 0 or "success_rate" in row or i == len(rows) - 1
+    ]
+
+
+def machine() -> dict[str, Any]:
+    """Returns where and with what a record was made."""
+    devices = [sys.executable, "-c", "import jax; print(jax.devices()[0].device_kind)"]
+    backend = "from jaxskills import physics; print(physics.default_backend())"
+    return {
+        "device": _said(devices),
+        "backend": _said([sys.executable, "-c", backend]),
+        "processor": _processor(),
+        "cores": usable_cores(),
+        "versions": {"python": platform.python_version()} | {p: version(p) for p in _PACKAGES},
+        "commit": _said(["git", "-C", str(RESULTS), "rev-parse", "HEAD"]),
+        "clean": not _said(["git", "-C", str(RESULTS), "status", "--porcelain", "../../src"]),
+    }
+
+
+def _said(command: list[str]) -> str:
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
+def _processor() -> str:
+    """Returns the name of the processor as Linux knows it, else as Python does."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.is_file() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def main() -> None:
+    """Runs all skills and seeds in turn."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("skills", nargs="+", help="recipes, see `jaxskills train --help`")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="where run folders go")
+    options = parser.parse_args()
+    for skill in options.skills:
+        for seed in options.seeds:
+            record = reproduce(skill, seed, options.runs)
+            path = RESULTS / f"{Path(skill).stem}-{seed}.json"
+            path.write_text(json.dumps(record, indent=1) + "\n")
+            print(f"wrote {path}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures of the README are those of the files under experiments/results."""
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "experiments" / f"{name}.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+RECORD = {
+    "skill": "walk",
+    "seed": 2,
+    "samples": 1_234_000,
+    "wall_s": 90.0,
+    "evaluate": {"success_rate": 0.984375, "episodes": 64},
+    "evaluate_600hz": None,
+    "processor": "Abacus",
+    "cores": 2,
+    "backend": "cpu",
+}
+
+
+def test_a_row_of_the_table():
+    row = script("tables").row(RECORD)
+    assert row == "| walk | 2 | 1.23 M | 4.08 M | 1.5 | 98.4% of 64 | failed |"
+
+
+def test_records_come_in_order(tmp_path: Path):
+    for skill, seed in (("walk", 10), ("run", 1), ("walk", 9)):
+        text = json.dumps(RECORD | {"skill": skill, "seed": seed})
+        (tmp_path / f"{skill}-{seed}.json").write_text(text)
+    found = script("tables").records(tmp_path)
+    assert [(r["skill"], r["seed"]) for r in found] == [("run", 1), ("walk", 9), ("walk", 10)]
+
+
+def test_the_readme_shows_the_records():
+    tables = script("tables")
+    block = tables.BLOCK.search((ROOT / "README.md").read_text())
+    assert block and tables.table(tables.records(tables.RESULTS)) in block[0]
+
+
+@pytest.mark.parametrize("count", [1, 39, 40, 1000])
+def test_a_thinned_curve_keeps_its_ends_and_its_evaluations(count: int):
+    rows = [{"samples": i} | ({"success_rate": 0.5} if i == 7 else {}) for i in range(count)]
+    kept = script("reproduce").thinned(rows)
+    assert kept[0] is rows[0] and kept[-1] is rows[-1]
+    assert count <= 7 or rows[7] in kept
+    assert len(kept) <= 2 * 40 + 2
+
+
+def test_where_a_record_was_made():
+    found = script("reproduce").machine()
+    assert found["versions"]["jax"] and found["cores"] >= 1 and found["processor"]
+    assert found["device"] and found["backend"] in ("cpu", "mjx", "warp")
