@@ -120,6 +120,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where run folders go")
     options = parser.parse_args()
+    RESULTS.mkdir(exist_ok=True)
     for skill in options.skills:
         for seed in options.seeds:
             record = reproduce(skill, seed, options.runs)

@@ -74,7 +74,7 @@ def test_a_run_writes_its_settings_lines_events_and_state(config: TrainConfig, t
     assert list(tmp_path.glob("events.out.tfevents.*"))
     lines = _lines(tmp_path)
     assert lines == shown
-    assert _samples(tmp_path) == [5 * STEP, 10 * STEP, 12 * STEP]
+    assert _samples(tmp_path) == [STEP, 6 * STEP, 11 * STEP, 12 * STEP]  # the first at once
     for line in lines:
         assert {"samples", "wall_s", "survival_s"} <= set(line)
         assert 0.0 < line["survival_s"] < 10.0
@@ -96,7 +96,7 @@ def test_a_resumed_run_goes_on_where_it_stopped(config: TrainConfig, tmp_path: P
     assert (last["samples"], last["why"]) == (20 * STEP, "samples used up")
     lines = _lines(stopped)
     assert lines[: len(before)] == before
-    assert _samples(stopped) == [STEP * n for n in (5, 10, 12, 17, 20)]
+    assert _samples(stopped) == [STEP * n for n in (1, 6, 11, 12, 17, 20)]
     assert all(a["wall_s"] <= b["wall_s"] for a, b in zip(lines, lines[1:], strict=False))
     assert checkpoint.read_config(stopped).samples == 20 * STEP
 
@@ -122,8 +122,8 @@ def test_lines_after_the_checkpoint_are_told_once(
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"samples": 99')
     train.train(config, tmp_path, _quiet, resume=True)
-    assert _samples(tmp_path) == [5 * STEP, 10 * STEP, 12 * STEP]
-    assert len((tmp_path / "metrics.jsonl.bak").read_text().splitlines()) == 4
+    assert _samples(tmp_path) == [STEP, 6 * STEP, 11 * STEP, 12 * STEP]  # the first at once
+    assert len((tmp_path / "metrics.jsonl.bak").read_text().splitlines()) == 5
 
 
 def test_a_damaged_newest_checkpoint_is_refused_and_the_one_before_serves(
@@ -165,8 +165,8 @@ def test_the_first_ctrl_c_saves_and_stops(config: TrainConfig, tmp_path: Path):
     _, state, last = train.train(
         endless, tmp_path, lambda metrics: signal.raise_signal(signal.SIGINT)
     )
-    assert (last["why"], last["samples"], int(state.updates)) == ("interrupted", 5 * STEP, 5)
-    assert checkpoint.existing(tmp_path) == [5 * STEP]
+    assert (last["why"], last["samples"], int(state.updates)) == ("interrupted", STEP, 1)
+    assert checkpoint.existing(tmp_path) == [STEP]
     assert signal.getsignal(signal.SIGINT) is before
 
 
@@ -196,7 +196,7 @@ def test_changed_sizes_of_an_update_are_no_way_to_go_back_in_samples(
     assert last["samples"] >= 14 * STEP
     assert checkpoint.existing(tmp_path)[-1] == last["samples"]
     assert _samples(tmp_path) == sorted(_samples(tmp_path))
-    assert _samples(tmp_path)[:3] == [5 * STEP, 10 * STEP, 12 * STEP]
+    assert _samples(tmp_path)[:4] == [STEP, 6 * STEP, 11 * STEP, 12 * STEP]
 
 
 @pytest.mark.timeout(300)

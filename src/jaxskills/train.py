@@ -10,6 +10,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -50,34 +51,48 @@ def train(
     Raises:
       UserError: bad settings, or a run folder that is in use or cannot be resumed.
     """
+    begin = time.monotonic()
     made = trainer.make(config)
+    history: list[dict[str, Any]] = []
     if resume:
         state = checkpoint.restore(run, made)
         history = _rewind(run, int(state.samples))
+        update = jit(made.update, donate=True)
     else:
         _claim(run)
-        state, history = jit(made.init)(jax.random.key(config.seed)), []
+        init, update = _compile(made)
+        state = init(jax.random.key(config.seed))
     checkpoint.write_config(run, config)
     with _stop_signal() as stopped:
-        state, last = _loop(made, run, state, history, report, stopped)
+        state, last = _loop(made, update, run, state, history, begin, report, stopped)
     return made, state, last
+
+
+def _compile(made: Trainer) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Returns `init` and `update` compiled, both at the same time: a person waits for them."""
+    init = jit(made.init).lower(jax.random.key(0))
+    with ThreadPoolExecutor(1) as pool:
+        compiled_init = pool.submit(init.compile)
+        update = jit(made.update, donate=True).lower(init.out_info).compile()
+        return compiled_init.result(), update
 
 
 def _loop(
     made: Trainer,
+    update: Callable[..., Any],
     run: Path,
     state: TrainState,
     history: list[dict[str, Any]],
+    begin: float,
     report: Report,
     stopped: Callable[[], bool],
 ) -> tuple[TrainState, dict[str, Any]]:
     config = made.config
-    update = jit(made.update, donate=True)
     judge = _Judge(made)
     before = history[-1]["wall_s"] if history else 0.0
-    begin = saved = time.monotonic()
+    saved = time.monotonic()
     samples, sums, why = int(state.samples), [], ""
-    last: dict[str, Any] = {"samples": samples, "wall_s": before, "survival_s": 0.0}
+    last: dict[str, Any] = {"samples": samples, "wall_s": before}
     if history:
         last = history[-1]
     with (run / "metrics.jsonl").open("a") as lines, SummaryWriter(str(run)) as board:
@@ -90,7 +105,7 @@ def _loop(
                 state, metrics = update(state)
                 samples += config.envs * config.horizon
                 sums.append(jax.device_get(metrics))
-            if sums and (len(sums) == _LOG_UPDATES or why):
+            if sums and (len(sums) == _LOG_UPDATES or why or "survival_s" not in last):
                 last = line(made, sums, samples, before + time.monotonic() - begin)
                 sums = []
                 last |= judge(state, last["survival_s"])
