@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxskills import character, check, clip, measures, paths, repairs
+from jaxskills import character, check, clip, paths
 from jaxskills.character import Character
-from jaxskills.check import Report
-from jaxskills.clip_data import Clip, Skeleton
+from jaxskills.check import Report, measures, repairs
+from jaxskills.clip.data import Clip, Skeleton
 from jaxskills.errors import UserError
-from jaxskills.mapping import Mapping, guess_mapping
+from jaxskills.retarget.mapping import Mapping, guess_mapping
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxskills import clip, keyframes
+from jaxskills import clip
+from jaxskills.clip import keyframes
+from jaxskills.clip.keyframes import Key, Keyframes
 from jaxskills.errors import UserError
-from jaxskills.keyframes import Key, Keyframes
 
 TOML = """
 loop = false

@@ -16,9 +16,10 @@ ORDER: Sequence[str] = """
 errors paths compilation
 
 rotation pose
-clip_data roles clip_deepmimic clip_bvh keyframes clip
+clip.data clip.roles clip.deepmimic clip.bvh clip.keyframes clip
 character
-hinges posed mapping retarget measures repairs faults check
+retarget.hinges retarget.posed retarget.mapping retarget
+check.measures check.repairs check.faults check
 kinematics ground motion
 
 physics.quiet physics.ffi physics.base physics.cpu physics.box_floor physics.explicit

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxskills import character, clip, hinges, posed, retarget, roles
+from jaxskills import character, clip, retarget
 from jaxskills.character import Character
-from jaxskills.clip_data import Clip, Skeleton, build
+from jaxskills.clip import roles
+from jaxskills.clip.data import Clip, Skeleton, build
 from jaxskills.errors import UserError
-from jaxskills.mapping import Mapping
+from jaxskills.retarget import hinges, posed
+from jaxskills.retarget.mapping import Mapping
 
 FRAMES = 20
 

@@ -9,9 +9,10 @@ import jax
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
-from jaxskills import character, clip, clip_data, motion
+from jaxskills import character, clip, motion
 from jaxskills import physics as physics_lib
 from jaxskills.character import Character
+from jaxskills.clip import data as clip_data
 from jaxskills.env import bounds, core
 from jaxskills.learn.networks import NetworkConfig
 from jaxskills.learn.ppo import PPOConfig

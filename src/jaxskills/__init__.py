@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxskills.character import Character as Character
-    from jaxskills.clip_data import Clip as Clip
+    from jaxskills.clip.data import Clip as Clip
     from jaxskills.env.bounds import BoundsConfig as BoundsConfig
     from jaxskills.env.core import EnvConfig as EnvConfig
     from jaxskills.env.core import Environment as Environment
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from jaxskills.explore.starts import StartsConfig as StartsConfig
     from jaxskills.learn.networks import NetworkConfig as NetworkConfig
     from jaxskills.learn.ppo import PPOConfig as PPOConfig
-    from jaxskills.mapping import Mapping as Mapping
     from jaxskills.motion import Motion as Motion
     from jaxskills.motion import MotionConfig as MotionConfig
     from jaxskills.recipes import Recipe as Recipe
+    from jaxskills.retarget.mapping import Mapping as Mapping
     from jaxskills.trainer import TrainConfig as TrainConfig
     from jaxskills.trainer import Trainer as Trainer
     from jaxskills.trainer import TrainState as TrainState
@@ -31,11 +31,11 @@ __version__ = "0.1.0"
 _MODULE = {
     "BoundsConfig": "env.bounds",
     "Character": "character",
-    "Clip": "clip_data",
+    "Clip": "clip.data",
     "EnvConfig": "env.core",
     "Environment": "env.core",
     "EvaluateConfig": "evaluate",
-    "Mapping": "mapping",
+    "Mapping": "retarget.mapping",
     "Motion": "motion",
     "MotionConfig": "motion",
     "NetworkConfig": "learn.networks",

@@ -32,8 +32,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
-from jaxskills import clip_deepmimic
-from jaxskills.clip_data import Clip, build
+from jaxskills.clip import deepmimic
+from jaxskills.clip.data import Clip, build
 from jaxskills.errors import UserError, unknown
 
 INTERPOLATIONS = ("linear", "spline")
@@ -108,8 +108,8 @@ def compile(keyframes: Keyframes) -> Clip:  # noqa: A001
     times = np.linspace(0.0, end, max(round(end * keyframes.rate), 1) + 1)
     joints = tuple(name for name in keyframes.axes if name != "root")
     skeleton = None
-    if set(joints) <= set(clip_deepmimic.JOINTS):
-        joints, skeleton = clip_deepmimic.JOINTS, clip_deepmimic.skeleton()
+    if set(joints) <= set(deepmimic.JOINTS):
+        joints, skeleton = deepmimic.JOINTS, deepmimic.skeleton()
     turned = {name: _turns(keyframes, name, times) for name in ("root", *joints)}
     return build(
         keyframes.name,

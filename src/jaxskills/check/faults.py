@@ -10,11 +10,12 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxskills import hinges, measures, repairs, roles
 from jaxskills.character import Character
-from jaxskills.clip_data import Clip
-from jaxskills.mapping import Mapping, targets
-from jaxskills.retarget import Transfer, transfer
+from jaxskills.check import measures, repairs
+from jaxskills.clip import roles
+from jaxskills.clip.data import Clip
+from jaxskills.retarget import Transfer, hinges, transfer
+from jaxskills.retarget.mapping import Mapping, targets
 
 SEVERITIES = ("info", "warning", "fault")
 

@@ -7,11 +7,13 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxskills import mapping as mappings
-from jaxskills import posed, retarget, roles
+from jaxskills import retarget
 from jaxskills.character import Character
-from jaxskills.clip_data import Clip
-from jaxskills.mapping import Mapping
+from jaxskills.clip import roles
+from jaxskills.clip.data import Clip
+from jaxskills.retarget import mapping as mappings
+from jaxskills.retarget import posed
+from jaxskills.retarget.mapping import Mapping
 
 _FRAMES = 60  # at most so many frames are looked at when whole hypotheses are compared
 _SLACK = 0.05  # rad, overshoot of a joint's range that nobody sees

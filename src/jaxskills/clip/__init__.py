@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxskills import clip_bvh, clip_deepmimic, keyframes, paths
-from jaxskills.clip_data import Clip, Skeleton, build
+from jaxskills import paths
+from jaxskills.clip import bvh, deepmimic, keyframes
+from jaxskills.clip.data import Clip, Skeleton, build
 from jaxskills.errors import UserError, unknown
 
 __all__ = ["Clip", "Skeleton", "available", "build", "load", "save"]
@@ -120,9 +121,9 @@ def _read_npz(path: Path) -> Clip:
 
 
 _READERS = {
-    ".txt": clip_deepmimic.read,
-    ".json": clip_deepmimic.read,
-    ".bvh": clip_bvh.read,
+    ".txt": deepmimic.read,
+    ".json": deepmimic.read,
+    ".bvh": bvh.read,
     ".toml": keyframes.read,
     ".npz": _read_npz,
 }

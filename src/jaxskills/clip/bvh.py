@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxskills import roles
-from jaxskills.clip_data import Clip, Skeleton, build
+from jaxskills.clip import roles
+from jaxskills.clip.data import Clip, Skeleton, build
 from jaxskills.errors import UserError
 
 # BVH says nothing of its length unit; a leg (hip to ankle) of about this length tells it.

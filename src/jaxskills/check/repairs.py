@@ -6,8 +6,8 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxskills import roles
-from jaxskills.clip_data import Clip
+from jaxskills.clip import roles
+from jaxskills.clip.data import Clip
 from jaxskills.errors import unknown
 
 # What x (forward), y (left) and z (up) ought to be, in the axes as read.

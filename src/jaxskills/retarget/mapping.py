@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxskills import clip_deepmimic, roles
 from jaxskills.character import Character
-from jaxskills.clip_data import Clip, Skeleton
+from jaxskills.clip import deepmimic, roles
+from jaxskills.clip.data import Clip, Skeleton
 
 # Zero poses that point a bone this much apart get a rest rotation; less is a matter of style.
 _REST_DEGREES = 15.0
@@ -35,7 +35,7 @@ class Mapping:
 _ARMS_HANG = {"left_shoulder": (-90.0, 0.0, 0.0), "right_shoulder": (90.0, 0.0, 0.0)}
 _ARMS_OUT = {"LeftArm": (90.0, 0.0, 0.0), "RightArm": (-90.0, 0.0, 0.0)}
 
-DEEPMIMIC_TO_HUMANOID34 = Mapping({name: name for name in clip_deepmimic.JOINTS})
+DEEPMIMIC_TO_HUMANOID34 = Mapping({name: name for name in deepmimic.JOINTS})
 
 DEEPMIMIC_TO_ATLAS = Mapping(
     {

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxskills.clip_data import Clip, Skeleton, build
+from jaxskills.clip.data import Clip, Skeleton, build
 from jaxskills.errors import UserError, unknown
 
 # name, kind, parent, offset from the parent in m (x forward, y left, z up): the file format's own

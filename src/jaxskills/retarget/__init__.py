@@ -12,11 +12,12 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxskills import hinges, posed, roles
 from jaxskills.character import Character
-from jaxskills.clip_data import Clip
+from jaxskills.clip import roles
+from jaxskills.clip.data import Clip
 from jaxskills.errors import UserError, unknown
-from jaxskills.mapping import Mapping, facing, guess_mapping, joint_positions, targets
+from jaxskills.retarget import hinges, posed
+from jaxskills.retarget.mapping import Mapping, facing, guess_mapping, joint_positions, targets
 
 __all__ = ["Mapping", "Transfer", "guess_mapping", "retarget", "transfer"]
 

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxskills import faults, measures, posed, retarget
+from jaxskills import retarget
 from jaxskills.character import Character
-from jaxskills.clip_data import Clip
-from jaxskills.faults import SEVERITIES, Finding
-from jaxskills.mapping import Mapping, guess_mapping, targets
+from jaxskills.check import faults, measures
+from jaxskills.check.faults import SEVERITIES, Finding
+from jaxskills.clip.data import Clip
+from jaxskills.retarget import posed
+from jaxskills.retarget.mapping import Mapping, guess_mapping, targets
 
 __all__ = ["SEVERITIES", "Finding", "Report", "check", "format_report"]
 
