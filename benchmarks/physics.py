@@ -10,10 +10,12 @@ With --json the last line is one JSON object; `cpu_over_bare` is a ratio of the 
 
 import argparse
 import json
-import platform
+import shlex
 import statistics
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +23,7 @@ import mujoco
 import numpy as np
 from mujoco import batch, rollout
 
-from jaxskills import character, physics
+from jaxskills import character, physics, provenance
 from jaxskills.compilation import jit
 
 
@@ -114,8 +116,8 @@ def measure(args: argparse.Namespace) -> dict:
         "timestep_s": model.opt.timestep,
         "nv": model.nv,
         "repeats": args.repeats,
-        "machine": platform.processor() or platform.machine(),
-        "versions": {"jax": jax.__version__, "mujoco": mujoco.__version__},
+        "command": shlex.join(["python", *sys.argv]),
+        **provenance.describe(Path(__file__).parent),
     }
 
     def compare(backends: list[str], envs: int, steps: int, repeats: int) -> None:

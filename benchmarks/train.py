@@ -11,17 +11,19 @@ bounds, policy and new starts. With --json the last line is one JSON object.
 import argparse
 import dataclasses
 import json
-import platform
+import shlex
+import statistics
+import sys
 import time
 from collections.abc import Callable
-from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxskills import character as character_lib
-from jaxskills import physics, trainer
+from jaxskills import physics, provenance, trainer
 from jaxskills.compilation import jit
 from jaxskills.explore import starts as starts_lib
 from jaxskills.learn import ppo, rollout
@@ -89,15 +91,19 @@ def physics_only(
     return jit(run), state.current.state.sim
 
 
-def seconds(call: Callable[[], Any], repeats: int) -> list[float]:
-    """Returns the wall seconds of each repeat, after one warm-up."""
-    jax.block_until_ready(call())
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - begin)
-    return sorted(times)
+def take_turns(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
+    """Returns the wall seconds of each call, `repeats` times, in turns, after one warm-up.
+
+    Whatever else the machine does meanwhile hits all of them.
+    """
+    times = {name: [] for name in calls}
+    for repeat in range(repeats + 1):
+        for name, call in calls.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(call())
+            if repeat:
+                times[name].append(time.perf_counter() - begin)
+    return times
 
 
 def main() -> None:
@@ -113,8 +119,8 @@ def main() -> None:
     config = dataclasses.replace(
         trainer.TrainConfig(clip=options.clip), envs=options.envs, horizon=options.horizon
     )
-    times = {name: seconds(call, options.repeats) for name, call in parts(config).items()}
-    median = {name: row[len(row) // 2] for name, row in times.items()}
+    times = take_turns(parts(config), options.repeats)
+    median = {name: statistics.median(row) for name, row in times.items()}
     count = config.envs * config.horizon
     shares = {
         "physics": median["physics"] / median["update"],
@@ -123,16 +129,15 @@ def main() -> None:
     }
     result = {
         "control_steps_per_s": count / median["update"],
-        "control_steps_per_s_best": count / times["update"][0],
+        "control_steps_per_s_best": count / min(times["update"]),
         "shares": shares,
         "median_ms": {name: 1e3 * value for name, value in median.items()},
         "envs": config.envs,
         "horizon": config.horizon,
         "substeps": config.env.substeps,
-        "device": str(jax.devices()[0]),
-        "processor": platform.machine(),
-        "cores": physics.usable_cores(),
-        "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
+        "command": shlex.join(["python", *sys.argv]),
+        "repeats": options.repeats,
+        **provenance.describe(Path(__file__).parent),
     }
     print(f"{result['control_steps_per_s']:.0f} control steps/s of the whole loop")
     for name, share in shares.items():

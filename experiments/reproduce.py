@@ -11,21 +11,18 @@ be started again. `experiments/tables.py` prints the tables.
 
 import argparse
 import json
-import platform
 import shlex
 import subprocess
 import sys
 import time
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from jaxskills.physics import usable_cores
+from jaxskills import provenance
+from jaxskills.evaluate import FINE_SUBSTEPS
 
 RESULTS = Path(__file__).parent / "results"
-SUBSTEPS_600_HZ = 20  # of a control step of 1/30 s, SB section 5
 _CURVE = 40  # points kept of a learning curve
-_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
 
 
 def reproduce(skill: str, seed: int, runs: Path) -> dict[str, Any]:
@@ -38,7 +35,7 @@ def reproduce(skill: str, seed: int, runs: Path) -> dict[str, Any]:
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     last = rows[-1]
     record = {
-        "command": shlex.join(["jaxskills", *options]),
+        "command": shlex.join(["jaxskills", *options[:-1], f"runs/{run.name}"]),
         "skill": skill,
         "seed": seed,
         "exit_code": code,
@@ -47,12 +44,12 @@ def reproduce(skill: str, seed: int, runs: Path) -> dict[str, Any]:
         "wall_s": last["wall_s"],
         "first_line_s": first,
         "command_s": seconds,
-        **machine(),
+        **provenance.describe(RESULTS.parent),
     }
-    for name, rate in (("evaluate", []), ("evaluate_600hz", ["--substeps", str(SUBSTEPS_600_HZ)])):
+    for name, rate in (("evaluate", []), ("evaluate_600hz", ["--substeps", str(FINE_SUBSTEPS)])):
         answer = jaxskills("evaluate", str(run), "--episodes", "64", "--json", *rate)
         record[name] = json.loads(answer) if answer else None
-    keep = ("samples", "wall_s", "survival_s", "success_rate")
+    keep = ("samples", "wall_s", "survival_s", "success_rate", "fine_success_rate")
     record["curve"] = [{k: row[k] for k in keep if k in row} for row in thinned(rows)]
     return record
 
@@ -84,33 +81,6 @@ def thinned(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         for i, row in enumerate(rows)
         if i % stride == 0 or "success_rate" in row or i == len(rows) - 1
     ]
-
-
-def machine() -> dict[str, Any]:
-    """Returns where and with what a record was made."""
-    devices = [sys.executable, "-c", "import jax; print(jax.devices()[0].device_kind)"]
-    backend = "from jaxskills import physics; print(physics.default_backend())"
-    return {
-        "device": _said(devices),
-        "backend": _said([sys.executable, "-c", backend]),
-        "processor": _processor(),
-        "cores": usable_cores(),
-        "versions": {"python": platform.python_version()} | {p: version(p) for p in _PACKAGES},
-        "commit": _said(["git", "-C", str(RESULTS), "rev-parse", "HEAD"]),
-        "clean": not _said(["git", "-C", str(RESULTS), "status", "--porcelain", "../../src"]),
-    }
-
-
-def _said(command: list[str]) -> str:
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-
-
-def _processor() -> str:
-    """Returns the name of the processor as Linux knows it, else as Python does."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.is_file() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every test shares: a home folder and compiled code for the session, the real clips."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,8 +29,14 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """What one test has compiled the next ones find, as runs of the command line do."""
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
+    """What one test has compiled the next ones find, as runs of the command line do.
+
+    With pytest-xdist the workers share it: their folders are beside each other.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    jax.config.update("jax_compilation_cache_dir", str(folder / "compiled"))
 
 
 @pytest.fixture(scope="session")

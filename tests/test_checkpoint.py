@@ -2,6 +2,7 @@
 """Checkpoints: what is kept, what is refused, and a configuration written and read."""
 
 import dataclasses
+import errno
 import json
 from pathlib import Path
 
@@ -156,3 +157,20 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path):
     with pytest.raises(UserError) as raised:
         checkpoint.read_config(tmp_path / "nothing")
     assert str(raised.value) == f"'{tmp_path}/nothing' is not a run: it has no config.json"
+
+
+def test_a_configuration_is_replaced_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    checkpoint.write_config(tmp_path, TrainConfig(seed=1))
+    whole = Path.write_text
+
+    def half(path: Path, text: str) -> int:
+        whole(path, text[: len(text) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_text", half)
+    with pytest.raises(OSError, match="No space"):
+        checkpoint.write_config(tmp_path, TrainConfig(seed=2))
+    assert checkpoint.read_config(tmp_path).seed == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]

@@ -5,7 +5,9 @@ A run folder holds `config.json`, `metrics.jsonl`, TensorBoard events and `check
 """
 
 import dataclasses
+import errno
 import json
+import os
 import shutil
 import types
 import typing
@@ -16,6 +18,7 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
+from jaxskills import paths
 from jaxskills.errors import UserError
 from jaxskills.trainer import TrainConfig, Trainer, TrainState
 
@@ -33,11 +36,19 @@ def save(run: Path, state: TrainState, samples: int) -> Path:
     folder = (run / "checkpoints").absolute()
     path = folder / f"{samples:012d}"
     if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        _need(folder, sum(leaf.nbytes for leaf in jax.tree.leaves(state)))
         with ocp.StandardCheckpointer() as writer:
             writer.save(path, state)
     for old in existing(run)[:-_KEPT]:
         shutil.rmtree(folder / f"{old:012d}", ignore_errors=True)
     return path
+
+
+def _need(folder: Path, size: int) -> None:
+    """Raises OSError without room for `size` bytes: orbax would leave half a checkpoint."""
+    if shutil.disk_usage(folder).free < 1.1 * size + 65536:  # its own files come on top
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
 def existing(run: Path) -> list[int]:
@@ -76,7 +87,7 @@ def restore(run: Path, trainer: Trainer) -> TrainState:
 def write_config(run: Path, config: TrainConfig) -> None:
     """Writes `RUN/config.json`."""
     text = json.dumps(dataclasses.asdict(config), indent=2)
-    (run / "config.json").write_text(text + "\n")
+    paths.write_whole(run / "config.json", text + "\n")
 
 
 def read_config(run: Path) -> TrainConfig:

@@ -21,6 +21,7 @@ from jaxskills.motion import CONTROL_DT
 from jaxskills.trainer import Trainer, TrainState
 
 SUCCESS_RATE = 0.95  # of episodes that last `seconds`, when a skill counts as learnt
+FINE_SUBSTEPS = 20  # of a control step: 600 Hz, SB section 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +30,7 @@ class EvaluateConfig:
 
     seconds: float = 20.0  # SB Table 1
     episodes: int = 64
-    substeps: int | None = None  # physics steps per control step; 20 is SB's 600 Hz
+    substeps: int | None = None  # physics steps per control step; None: as in the training
     seed: int = 1
 
 

@@ -44,3 +44,17 @@ def deepmimic_dir() -> Path:
             f" or set {CLIP_DIR_VARIABLE} to a folder that holds them"
         )
     return Path(spec.origin).parent / "data" / "motions"
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Writes a file so that it is the old one or the new one, whatever the disk does meanwhile.
+
+    Raises:
+      OSError: the disk is full or the folder cannot be written.
+    """
+    beside = path.with_name(path.name + ".new")
+    try:
+        beside.write_text(text)
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
