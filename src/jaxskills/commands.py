@@ -106,7 +106,7 @@ def train(command: arguments.Train, config: TrainConfig) -> Answer:
     )
     run, name = command.out, recipes.find(command.skill).name
     done = max(checkpoint.existing(run), default=0) if command.resume else 0
-    print(f"{name}: compiling, which takes a minute or two the first time", file=sys.stderr)
+    print(f"{name}: compiling, which takes half a minute the first time", file=sys.stderr)
     with progress.live(name, config.samples, done) as report, _enough_memory(config):
         made, state, last = train_lib.train(config, run, report, command.resume)
     if last["why"] == "interrupted":

@@ -7,7 +7,11 @@ from typing import Any
 import jax
 
 # On a CPU the older loop emitter compiles the kinematics four times as fast, and they run faster.
-_CPU_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+# Levels 1 to 3 of LLVM give equally fast updates, and 1 compiles them in 10 s instead of 12.
+_CPU_OPTIONS: dict[str, Any] = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 1,
+}
 
 
 def jit(function: Callable[..., Any], *, donate: bool = False) -> Any:

@@ -105,10 +105,12 @@ def _loop(
                 state, metrics = update(state)
                 samples += config.envs * config.horizon
                 sums.append(jax.device_get(metrics))
-            if sums and (len(sums) == _LOG_UPDATES or why or "survival_s" not in last):
+            first = "survival_s" not in last
+            if sums and (len(sums) == _LOG_UPDATES or why or first):
                 last = line(made, sums, samples, before + time.monotonic() - begin)
                 sums = []
-                last |= judge(state, last["survival_s"])
+                if not first:  # few episodes have ended yet, so their mean says nothing
+                    last |= judge(state, last["survival_s"])
                 if judge.learnt:
                     why = "learnt"
                 lines.write(json.dumps(last) + "\n")
