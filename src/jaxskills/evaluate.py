@@ -20,7 +20,6 @@ from jaxskills.learn.networks import Networks
 from jaxskills.motion import CONTROL_DT
 from jaxskills.trainer import Trainer, TrainState
 
-SUCCESS_RATE = 0.95  # of episodes that last `seconds`, when a skill counts as learnt
 FINE_SUBSTEPS = 20  # of a control step: 600 Hz, SB section 5
 
 

@@ -28,6 +28,9 @@ from jaxskills.trainer import TrainConfig, Trainer, TrainState
 SAVE_SECONDS = 120.0  # between checkpoints
 _LOG_UPDATES = 5  # between lines of metrics.jsonl
 _EVALUATION_SHARE = 0.2  # of the time, at most
+# Of 64 episodes, to stop. A skill is to stand 20 s in 95 % (SB Table 1), but stopping at that rate is
+# stopping by luck: in 64 other episodes it comes out lower.
+_SURE_RATE = 0.98
 _PROMISING_SECONDS = 2.0  # of survival while exploring, before an evaluation is worth its time
 
 Report = Callable[[Mapping[str, Any]], None]
@@ -142,10 +145,10 @@ class _Judge:
         if time.monotonic() < self._due or survival < _PROMISING_SECONDS or not enabled:
             return {}
         found, spent = self._evaluate(state, None)
-        if found["success_rate"] >= evaluate.SUCCESS_RATE:
+        if found["success_rate"] >= _SURE_RATE:
             fine, more = self._evaluate(state, evaluate.FINE_SUBSTEPS)
             found["fine_success_rate"] = fine["success_rate"]
-            self.learnt = fine["success_rate"] >= evaluate.SUCCESS_RATE
+            self.learnt = fine["success_rate"] >= _SURE_RATE
             spent += more
         self._due = time.monotonic() + spent / _EVALUATION_SHARE
         names = ("success_rate", "fine_success_rate", "seconds_mean", "inside_seconds_mean")
