@@ -5,13 +5,14 @@
 
 For each skill and seed: `jaxskills train` with the default settings, then `jaxskills evaluate` over
 64 episodes at the physics rate of the training and at 600 Hz. One JSON file each is written to
-`experiments/results/`. A run folder that exists is resumed, so a reproduction that was cut off can
-be started again. `experiments/tables.py` prints the tables.
+`experiments/results/`, and the film strip of the first seed. A run folder that exists is resumed,
+so a reproduction that was cut off can be started again. `experiments/tables.py` prints the tables.
 """
 
 import argparse
 import json
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -96,6 +97,9 @@ def main() -> None:
             record = reproduce(skill, seed, options.runs)
             path = RESULTS / f"{Path(skill).stem}-{seed}.json"
             path.write_text(json.dumps(record, indent=1) + "\n")
+            strip = options.runs / f"{Path(skill).stem}-{seed}" / f"{Path(skill).stem}.png"
+            if seed == options.seeds[0] and strip.is_file():
+                shutil.copy(strip, RESULTS / strip.name)
             print(f"wrote {path}", file=sys.stderr)
 
 
