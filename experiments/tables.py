@@ -14,7 +14,7 @@ from typing import Any
 
 RESULTS = Path(__file__).parent / "results"
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks" / "results"
-BLOCK = re.compile(r"(<!-- tables\.py -->\n).*?(\n<!-- end of tables\.py -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- tables\.py -->\n).*?(<!-- end of tables\.py -->)", re.DOTALL)
 PAPER = {"walk": 4.08e6, "run": 4.11e6}  # samples, SB Table 1
 
 _HEAD = (
@@ -86,7 +86,7 @@ def main() -> None:
     before = options.write.read_text()
     if not BLOCK.search(before):
         parser.error(f"{options.write} has no line <!-- tables.py -->")
-    options.write.write_text(BLOCK.sub(lambda found: found[1] + text + found[2], before))
+    options.write.write_text(BLOCK.sub(lambda found: f"{found[1]}{text}\n{found[2]}", before))
 
 
 if __name__ == "__main__":
