@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every test shares: a home folder and compiled code for the session, the real clips."""
+"""What every test shares: a home folder and compiled code for the whole run, the real clips."""
 
 import os
 from collections.abc import Iterator

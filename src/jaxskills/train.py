@@ -28,7 +28,7 @@ from jaxskills.trainer import TrainConfig, Trainer, TrainState
 SAVE_SECONDS = 120.0  # between checkpoints
 _LOG_UPDATES = 5  # between lines of metrics.jsonl
 _EVALUATION_SHARE = 0.2  # of the time, at most
-# Of 64 episodes, to stop. A skill is to stand 20 s in 95 % (SB Table 1), but who stops at that rate
+# Of 64 episodes, to stop. A skill is to stand 20 s (SB Table 1) in 95 %, but who stops at that rate
 # stops by luck: in 64 other episodes it comes out lower.
 _SURE_RATE = 0.98
 _PROMISING_SECONDS = 2.0  # of survival while exploring, before an evaluation is worth its time
