@@ -99,6 +99,23 @@ def sample(layout: pose.Layout, motion: Motion, phase: jax.Array) -> tuple[jax.A
     return _after_cycles(motion, cycle, qpos, qvel)
 
 
+def fold(
+    layout: pose.Layout, motion: Motion, qpos: jax.Array, qvel: jax.Array, phase: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns a state `[nq]`, `[nv]` and its `phase []` moved back into the first cycle.
+
+    It is turned back by the yaw of the cycles gone by, and its root is put on the reference's,
+    horizontally, so what it had drifted is forgiven. A motion without loop has one cycle.
+    """
+    cycle = jnp.floor(phase / motion.length) if motion.loop else jnp.zeros_like(phase)
+    inside = jnp.clip(phase - cycle * motion.length, 0.0, motion.length)
+    back = rotation.about_z(-cycle * motion.cycle_yaw)
+    at = sample(layout, motion, inside)[0][:2]
+    rot = rotation.mul(back, qpos[3:7])
+    qpos = jnp.concatenate((at, qpos[2:3], rot, qpos[7:]))
+    return qpos, jnp.concatenate((rotation.rotate(back, qvel[:3]), qvel[3:])), inside
+
+
 def _after_cycles(
     motion: Motion, cycle: jax.Array, qpos: jax.Array, qvel: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -44,6 +44,7 @@ class EnvConfig:
     feedforward: bool = True  # off: displacements are from the zero pose, not from the reference
     reward: Literal["survival", "imitation"] = "survival"
     stop: Literal["bounds", "fall"] = "bounds"  # what ends an episode; DeepMimic: a fall
+    may_touch: tuple[str, ...] | None = None  # bodies that may touch the ground; None: the feet
     heading: Literal["forward", "lateral"] = "forward"  # lateral for backflips and rolls, SB 4.1
 
 
@@ -130,7 +131,8 @@ def make(
     forward = character.forward / np.linalg.norm(character.forward)
     lateral = np.cross([0.0, 0.0, 1.0], forward)
     axis = jnp.asarray(forward if config.heading == "forward" else lateral, jnp.float32)
-    allowed = {character.body(name) for name in character.ground}
+    grounded = character.ground if config.may_touch is None else config.may_touch
+    allowed = {character.body(name) for name in grounded}
     no_touch = np.array([i for i in range(len(character.body_names)) if i not in allowed], int)
     forbidden = np.array(bounds.forbidden, int)
     dofs = np.array(servos.dofs)
