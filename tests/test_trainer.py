@@ -19,6 +19,7 @@ from jaxskills.compilation import jit
 from jaxskills.env.bounds import BoundsConfig
 from jaxskills.env.core import EnvConfig
 from jaxskills.errors import UserError
+from jaxskills.explore.evolution import EvolutionConfig
 from jaxskills.explore.starts import StartsConfig
 from jaxskills.learn import gae, rollout
 from jaxskills.learn.networks import NetworkConfig
@@ -175,6 +176,23 @@ def test_two_seeds_in_one_program_are_two_runs(made: Trainer, init, update: Upda
             np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-3)
 
 
+def test_starts_evolve(tmp_path: Path):
+    """Elites are in the state, change with updates, and stand still in shape and in their place."""
+    evolution = EvolutionConfig(enabled=True, elites=4)
+    made = trainer.make(tiny.train_config(tmp_path, evolution=evolution))
+    begin = jit(made.init)(jax.random.key(0))
+    state = _run(jit(made.update), begin, 4)
+    assert begin.elites is not None and state.elites is not None
+    assert not np.array_equal(begin.elites.phase, state.elites.phase)
+    assert float(state.elites.value.max()) > 0.0
+    assert (state.elites.phase >= 0).all() and (state.elites.phase <= made.env.length).all()
+    for leaf in _leaves(state):
+        assert np.isfinite(leaf).all()
+    # Each elite is near the reference, since it was visited within the bounds.
+    heights = np.asarray(state.elites.qpos)[..., 2]
+    assert np.abs(heights - 0.5).max() < 0.3
+
+
 def _transitions(made: Trainer, obs_size: int) -> rollout.Transition:
     """Returns four steps of eight environments, all numbers random, nothing ended."""
     rng = np.random.default_rng(0)
@@ -183,6 +201,7 @@ def _transitions(made: Trainer, obs_size: int) -> rollout.Transition:
         obs=normal(obs_size),
         next_obs=normal(obs_size),
         phase=30.0 * jnp.abs(normal()),
+        state=None,
         action=normal(made.env.action_size),
         log_prob=normal(),
         rate=normal(),

@@ -17,11 +17,12 @@ from jaxskills import character as character_lib
 from jaxskills import clip as clip_lib
 from jaxskills import motion as motion_lib
 from jaxskills import physics as physics_lib
-from jaxskills import retarget
+from jaxskills import pose, retarget
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import core
 from jaxskills.errors import UserError
+from jaxskills.explore import evolution as evolution_lib
 from jaxskills.explore import starts as starts_lib
 from jaxskills.learn import gae, normalize, rollout
 from jaxskills.learn import networks as networks_lib
@@ -47,6 +48,7 @@ class TrainConfig:
     bounds: bounds_lib.BoundsConfig = dataclasses.field(default_factory=bounds_lib.BoundsConfig)
     motion: motion_lib.MotionConfig = motion_lib.MotionConfig()
     starts: starts_lib.StartsConfig = starts_lib.StartsConfig()
+    evolution: evolution_lib.EvolutionConfig = evolution_lib.EvolutionConfig()
     networks: networks_lib.NetworkConfig = networks_lib.NetworkConfig()
     ppo: ppo_lib.PPOConfig = ppo_lib.PPOConfig()
 
@@ -58,6 +60,7 @@ class TrainState:
     learner: ppo_lib.Learner
     normalizer: normalize.Normalizer
     starts: starts_lib.Starts
+    elites: evolution_lib.Elites | None  # None: episodes begin on the reference
     current: rollout.Fresh  # the B environments and what they show
     key: jax.Array  # root of all randomness; the number of updates is folded in
     updates: jax.Array  # [] int32
@@ -109,26 +112,41 @@ def make(config: TrainConfig) -> Trainer:
     obs_size = jax.eval_shape(lambda: env.observe(env.start(jnp.float32(0.0)))).shape[0]
     nets = networks_lib.make(config.networks, obs_size, env.action_size, config.ppo.discount)
 
+    layout = character.layout
+
+    def begin(
+        starts: starts_lib.Starts, elites: evolution_lib.Elites | None, key: jax.Array
+    ) -> rollout.Fresh:
+        if elites is None:
+            phase = starts_lib.sample(config.starts, starts, key, config.envs, env.length)
+            return rollout.begin(env, phase)
+        segment_key, elite_key = jax.random.split(key)
+        segment = starts_lib.sample_segments(config.starts, starts, segment_key, config.envs)
+        return rollout.begin_at(
+            env, *evolution_lib.draw(config.evolution, layout, elites, elite_key, segment)
+        )
+
     def init(key: jax.Array) -> TrainState:
         learner_key, start_key, key = jax.random.split(key, 3)
-        starts = starts_lib.init(config.starts)
-        phase = starts_lib.sample(config.starts, starts, start_key, config.envs, env.length)
-        current = rollout.begin(env, phase)
+        starts, elites = starts_lib.init(config.starts), None
+        if config.evolution.enabled:
+            elites = evolution_lib.init(config.evolution, layout, motion, config.starts.segments)
+        current = begin(starts, elites, start_key)
         normalizer = normalize.update(normalize.init(obs_size), current.obs)
         learner = ppo_lib.init(config.ppo, nets, learner_key)
-        return TrainState(learner, normalizer, starts, current, key, jnp.int32(0), jnp.uint32(0))
+        counts = jnp.int32(0), jnp.uint32(0)
+        return TrainState(learner, normalizer, starts, elites, current, key, *counts)
 
     def update(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(state.key, state.updates)
-        start_key, act_key, learn_key = jax.random.split(key, 3)
-        phase = starts_lib.sample(config.starts, state.starts, start_key, config.envs, env.length)
+        start_key, act_key, learn_key, evolve_key = jax.random.split(key, 4)
         current, steps = rollout.collect(
             env,
             nets,
             state.learner.policy,
             state.normalizer,
             state.current,
-            rollout.begin(env, phase),
+            begin(state.starts, state.elites, start_key),
             act_key,
             config.horizon,
         )
@@ -138,11 +156,18 @@ def make(config: TrainConfig) -> Trainer:
         starts = starts_lib.update(
             config.starts, state.starts, steps.phase.reshape(-1), batch.target, env.length
         )
+        elites = state.elites
+        if elites is not None:
+            visited = visited_states(layout, motion, steps, batch.target)
+            elites = evolution_lib.update(
+                config.evolution, elites, visited, evolve_key, motion.length
+            )
         metrics |= episode_metrics(env, steps)
         new_state = TrainState(
             learner,
             normalize.update(state.normalizer, flat_obs),
             starts,
+            elites,
             current,
             state.key,
             state.updates + 1,
@@ -185,6 +210,17 @@ def to_batch(
     )
 
 
+def visited_states(
+    layout: pose.Layout, motion: Motion, steps: rollout.Transition, value: jax.Array
+) -> evolution_lib.Visited:
+    """Returns the states of transitions `[T, B]` in the first cycle, and their `value [T B]`."""
+    flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
+    folded = jax.vmap(lambda q, v, phase: motion_lib.fold(layout, motion, q, v, phase))(
+        flat(steps.state.sim.qpos), flat(steps.state.sim.qvel), flat(steps.phase)
+    )
+    return evolution_lib.Visited(*folded, value)
+
+
 def episode_metrics(env: core.Environment, steps: rollout.Transition) -> dict[str, jax.Array]:
     """Returns counts of an update, to be summed over updates by whoever shows them.
 
@@ -217,4 +253,5 @@ def validate(config: TrainConfig) -> None:
         raise UserError(f"seed is {config.seed}: give 0 to {2**32 - 1}")
     core.validate(config.env)
     starts_lib.validate(config.starts)
+    evolution_lib.validate(config.evolution)
     ppo_lib.validate(config.ppo, config.envs * config.horizon)

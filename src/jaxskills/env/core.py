@@ -88,6 +88,7 @@ class Environment(NamedTuple):
     """Pure functions of one environment, and their sizes."""
 
     start: Callable[[jax.Array], EnvState]  # (phase []) -> a state on the reference there
+    place: Callable[[jax.Array, jax.Array, jax.Array], EnvState]  # (phase, qpos [nq], qvel [nv])
     observe: Callable[[EnvState], jax.Array]  # (state) -> obs [O]
     step: Callable[[EnvState, jax.Array], tuple[EnvState, Outcome]]  # (state, action [A])
     action_size: int
@@ -166,7 +167,9 @@ def make(
         )
 
     def start(phase: jax.Array) -> EnvState:
-        qpos, qvel = sample(layout, motion, phase)
+        return place(phase, *sample(layout, motion, phase))
+
+    def place(phase: jax.Array, qpos: jax.Array, qvel: jax.Array) -> EnvState:
         lowest = jnp.min(ground.clearance(shapes, bodies_of(qpos, qvel)))
         qpos = qpos.at[2].add(jnp.maximum(_LIFT_MARGIN - lowest, 0.0))
         sim = physics.init(model, jnp.int32(0), qpos, qvel)
@@ -237,7 +240,8 @@ def make(
         )
         return state, outcome
 
-    return Environment(start, observe_state, step, len(dofs), endings, float(motion.length))
+    length = float(motion.length)
+    return Environment(start, place, observe_state, step, len(dofs), endings, length)
 
 
 def validate(config: EnvConfig) -> None:

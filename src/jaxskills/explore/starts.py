@@ -52,10 +52,15 @@ def sample(
 ) -> jax.Array:
     """Returns `[count]` phases in [0, length) (control frames). The key is consumed."""
     segment_key, place_key = jax.random.split(key)
-    chances = jnp.log(probabilities(starts, config.uniform))
-    segment = jax.random.categorical(segment_key, chances, shape=(count,))
+    segment = sample_segments(config, starts, segment_key, count)
     place = jax.random.uniform(place_key, (count,))
     return (segment + place) / config.segments * length
+
+
+def sample_segments(config: StartsConfig, starts: Starts, key: jax.Array, count: int) -> jax.Array:
+    """Returns `[count]` int32 segments in which episodes shall begin. The key is consumed."""
+    chances = jnp.log(probabilities(starts, config.uniform))
+    return jax.random.categorical(key, chances, shape=(count,))
 
 
 def update(

@@ -27,6 +27,7 @@ class Transition:
     obs: jax.Array  # [T, B, O] before the step
     next_obs: jax.Array  # [T, B, O] after it, before any new start
     phase: jax.Array  # [T, B] before the step
+    state: Any  # EnvState [T, B] before the step
     action: jax.Array  # [T, B, A]
     log_prob: jax.Array  # [T, B]
     rate: jax.Array  # [T, B]
@@ -39,7 +40,15 @@ class Transition:
 
 def begin(env: Environment, phase: jax.Array) -> Fresh:
     """Returns starts on the reference at `phase [B]`."""
-    state = jax.vmap(env.start)(phase)
+    return _observed(env, jax.vmap(env.start)(phase))
+
+
+def begin_at(env: Environment, phase: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Fresh:
+    """Returns starts at `phase [B]` in the states `qpos [B, nq]` and `qvel [B, nv]`."""
+    return _observed(env, jax.vmap(env.place)(phase, qpos, qvel))
+
+
+def _observed(env: Environment, state: Any) -> Fresh:
     return Fresh(state, jax.vmap(env.observe)(state))
 
 
@@ -80,6 +89,7 @@ def _transition(now: Fresh, outcome: Outcome, action: jax.Array, chance: jax.Arr
         obs=now.obs,
         next_obs=outcome.obs,
         phase=now.state.phase,
+        state=now.state,
         action=action,
         log_prob=chance,
         rate=outcome.rate,
