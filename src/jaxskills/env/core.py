@@ -18,6 +18,7 @@ from jaxskills import ground, kinematics, pose
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import observe, rewards
+from jaxskills.env import style as style_lib
 from jaxskills.errors import UserError
 from jaxskills.kinematics import Bodies
 from jaxskills.motion import CONTROL_DT, Motion, sample
@@ -42,7 +43,11 @@ class EnvConfig:
     # DeepMimic gains lags by 0.1 s, and a run leaves its bounds within 0.1 s by its knees alone.
     velocity_feedforward: bool = True
     feedforward: bool = True  # off: displacements are from the zero pose, not from the reference
-    reward: Literal["survival", "imitation"] = "survival"
+    # What a step inside the bounds earns: 1, DeepMimic's imitation, a style (SB eq. 8), or imitation
+    # and style weighted (SB eq. 13, for comparison).
+    reward: Literal["survival", "imitation", "style", "blend"] = "survival"
+    style: style_lib.StyleConfig = style_lib.StyleConfig()
+    style_weight: float = 0.5  # of the style in a blend, w_s of SB eq. 13
     stop: Literal["bounds", "fall"] = "bounds"  # what ends an episode; DeepMimic: a fall
     may_touch: tuple[str, ...] | None = None  # bodies that may touch the ground; None: the feet
     heading: Literal["forward", "lateral"] = "forward"  # lateral for backflips and rolls, SB 4.1
@@ -189,8 +194,34 @@ def make(
             servos, layout, state.sim.qpos, state.sim.qvel, pose.plus(layout, base, d)
         )
 
+    def imitation(seen: _Seen) -> jax.Array:
+        return rewards.imitation(
+            weights,
+            seen.offset,
+            seen.velocity_error,
+            seen.effectors,
+            seen.bodies,
+            seen.reference,
+        )
+
+    def style(seen: _Seen, before: SimState, after: SimState) -> jax.Array:
+        earlier = bodies_of(before.qpos, before.qvel)
+        change = (after.qvel - before.qvel) / CONTROL_DT
+        joints = [jnp.linalg.norm(change[np.array(j.dofs)]) for j in layout.joints[1:]]
+        return style_lib.reward(config.style, params, seen.bodies, earlier, jnp.stack(joints))
+
+    def reward_of(seen: _Seen, before: SimState, after: SimState) -> jax.Array:
+        if config.reward == "imitation":
+            return imitation(seen)
+        if config.reward == "style":
+            return style(seen, before, after)
+        if config.reward == "blend":
+            w = config.style_weight
+            return (1.0 - w) * imitation(seen) + w * style(seen, before, after)
+        return jnp.float32(1.0)
+
     def step(state: EnvState, action: jax.Array) -> tuple[EnvState, Outcome]:
-        ctrl = control(state, action)
+        before, ctrl = state.sim, control(state, action)
         sim = physics.step(model, state.variant, state.sim, ctrl)
         dphase = jnp.float32(1.0)
         state = EnvState(sim, state.phase + dphase, state.step + 1, state.variant)
@@ -210,16 +241,6 @@ def make(
         by_bound = jnp.where(jnp.any(errors > sizes), worst, others[0])
         ended_by = jnp.where(config.stop == "fall", others[1], by_bound)
         ended_by = jnp.where(diverged, others[2], jnp.where(terminated, ended_by, others[3]))
-        reward = jnp.float32(1.0)
-        if config.reward == "imitation":
-            reward = rewards.imitation(
-                weights,
-                seen.offset,
-                seen.velocity_error,
-                seen.effectors,
-                seen.bodies,
-                seen.reference,
-            )
         report = Report(
             errors,
             sizes,
@@ -232,7 +253,7 @@ def make(
         outcome = Outcome(
             obs=features(state, seen),
             rate=jnp.float32(0.0),
-            spike=jnp.where(terminated, 0.0, reward),
+            spike=jnp.where(terminated, 0.0, reward_of(seen, before, sim)),
             dphase=dphase,
             terminated=terminated,
             truncated=truncated & ~terminated,
@@ -254,5 +275,14 @@ def validate(config: EnvConfig) -> None:
         raise UserError(f"env.substeps is {config.substeps}: give 1 to 100 (20 is 600 Hz)")
     if not CONTROL_DT <= config.seconds <= 3600:
         raise UserError(f"env.seconds is {config.seconds}: give 1/30 to 3600 s")
+    styled = config.reward in ("style", "blend")
+    if styled != (config.style.style != "none"):
+        raise UserError(
+            f"env.reward is {config.reward}, env.style.style is {config.style.style}: a reward style"
+            " or blend and a style go together"
+        )
+    if not 0 <= config.style_weight <= 1:
+        raise UserError(f"env.style_weight is {config.style_weight}: give 0 to 1")
+    style_lib.validate(config.style)
     if not -30 <= config.lead <= 30:
         raise UserError(f"env.lead is {config.lead}: give -30 to 30 control frames")
