@@ -43,8 +43,8 @@ class EnvConfig:
     # DeepMimic gains lags by 0.1 s, and a run leaves its bounds within 0.1 s by its knees alone.
     velocity_feedforward: bool = True
     feedforward: bool = True  # off: displacements are from the zero pose, not from the reference
-    # What a step inside the bounds earns: 1, DeepMimic's imitation, a style (SB eq. 8), or imitation
-    # and style weighted (SB eq. 13, for comparison).
+    # What a step inside the bounds earns: 1, DeepMimic's imitation, a style (SB eq. 8), or both
+    # weighted (SB eq. 13, for comparison).
     reward: Literal["survival", "imitation", "style", "blend"] = "survival"
     style: style_lib.StyleConfig = style_lib.StyleConfig()
     style_weight: float = 0.5  # of the style in a blend, w_s of SB eq. 13
@@ -278,8 +278,8 @@ def validate(config: EnvConfig) -> None:
     styled = config.reward in ("style", "blend")
     if styled != (config.style.style != "none"):
         raise UserError(
-            f"env.reward is {config.reward}, env.style.style is {config.style.style}: a reward style"
-            " or blend and a style go together"
+            f"env.reward is {config.reward}, env.style.style is {config.style.style}: a style needs"
+            " the reward style or blend, and these need a style"
         )
     if not 0 <= config.style_weight <= 1:
         raise UserError(f"env.style_weight is {config.style_weight}: give 0 to 1")
