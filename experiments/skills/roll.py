@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SB Table 1, roll: every body may touch the ground, heading along the lateral axis."""
+
+from jaxskills.env.core import EnvConfig
+from jaxskills.recipes import Recipe
+from jaxskills.trainer import TrainConfig
+
+_BODIES = (
+    "root",
+    "chest",
+    "neck",
+    "right_shoulder",
+    "left_shoulder",
+    "right_elbow",
+    "left_elbow",
+    "right_wrist",
+    "left_wrist",
+    "right_hip",
+    "left_hip",
+    "right_knee",
+    "left_knee",
+    "right_ankle",
+    "left_ankle",
+)
+
+RECIPE = Recipe(
+    name="roll",
+    clip="roll",
+    note="DeepMimic roll, 2.02 s a cycle. SB Table 1.",
+    config=TrainConfig(env=EnvConfig(may_touch=_BODIES, heading="lateral")),
+)
