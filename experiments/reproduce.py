@@ -24,15 +24,22 @@ from jaxskills.evaluate import FINE_SUBSTEPS
 
 RESULTS = Path(__file__).parent / "results"
 _CURVE = 40  # points kept of a learning curve
+_COLUMNS = ("samples", "wall_s", "survival_s", "success_rate", "fine_success_rate")
 
 
-def reproduce(skill: str, seed: int, runs: Path) -> dict[str, Any]:
-    """Returns the record of one run, JSON-ready."""
-    run = runs / f"{Path(skill).stem}-{seed}"
+def reproduce(skill: str, seed: int, run: Path, options: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Returns the record of one run, JSON-ready.
+
+    Args:
+      skill: as for `jaxskills train`.
+      seed: of the training.
+      run: folder; resumed if it has a configuration.
+      options: of `jaxskills train`, besides.
+    """
     resumed = (run / "config.json").is_file()
-    options = ["train", skill, "--seed", str(seed), "--out", str(run)]
-    print(f"{skill}, seed {seed}", file=sys.stderr)
-    code, seconds, first = train(options + ["--resume"] * resumed)
+    options = ("train", skill, "--seed", str(seed), *options, "--out", str(run))
+    print(shlex.join(options), file=sys.stderr)
+    code, seconds, first = train([*options, *["--resume"] * resumed])
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     last = rows[-1]
     record = {
@@ -50,8 +57,7 @@ def reproduce(skill: str, seed: int, runs: Path) -> dict[str, Any]:
     for name, rate in (("evaluate", []), ("evaluate_600hz", ["--substeps", str(FINE_SUBSTEPS)])):
         answer = jaxskills("evaluate", str(run), "--episodes", "64", "--json", *rate)
         record[name] = json.loads(answer) if answer else None
-    keep = ("samples", "wall_s", "survival_s", "success_rate", "fine_success_rate")
-    record["curve"] = [{k: row[k] for k in keep if k in row} for row in thinned(rows)]
+    record["curve"] = [{k: row[k] for k in _COLUMNS if k in row} for row in thinned(rows)]
     return record
 
 
@@ -84,6 +90,17 @@ def thinned(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
+def keep(record: dict[str, Any], run: Path, folder: Path, strip: str = "") -> None:
+    """Writes a record, and the film strip of its run if it is given a name, into `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{run.name}.json"
+    path.write_text(json.dumps(record, indent=1) + "\n")
+    made = sorted(run.glob("*.png"))
+    if strip and made:
+        shutil.copy(made[0], folder / f"{strip}.png")
+    print(f"wrote {path}", file=sys.stderr)
+
+
 def main() -> None:
     """Runs all skills and seeds in turn."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -91,16 +108,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where run folders go")
     options = parser.parse_args()
-    RESULTS.mkdir(exist_ok=True)
     for skill in options.skills:
         for seed in options.seeds:
-            record = reproduce(skill, seed, options.runs)
-            path = RESULTS / f"{Path(skill).stem}-{seed}.json"
-            path.write_text(json.dumps(record, indent=1) + "\n")
-            strip = options.runs / f"{Path(skill).stem}-{seed}" / f"{Path(skill).stem}.png"
-            if seed == options.seeds[0] and strip.is_file():
-                shutil.copy(strip, RESULTS / strip.name)
-            print(f"wrote {path}", file=sys.stderr)
+            name = Path(skill).stem
+            run = options.runs / f"{name}-{seed}"
+            strip = name if seed == options.seeds[0] else ""
+            keep(reproduce(skill, seed, run), run, RESULTS, strip)
 
 
 if __name__ == "__main__":

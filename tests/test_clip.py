@@ -366,3 +366,19 @@ def test_shipped_lengths(deepmimic: Path, name: str, frames: int, seconds: float
     one = clip.load(name)
     assert name in clip.available()
     assert len(one.times) == frames and one.duration == pytest.approx(seconds, abs=6e-4)
+
+
+def test_a_part_of_a_clip(tmp_path: Path):
+    whole = clip.load(
+        write(tmp_path / "four.txt", [frame(0.1, c1=[i, 1.0, 0.0]) for i in range(4)])
+    )
+    part = clip.cut(whole, 0.1, 0.2)
+    np.testing.assert_allclose(part.times, [0.0, 0.1])
+    np.testing.assert_array_equal(part.root_pos, whole.root_pos[1:3])
+    np.testing.assert_array_equal(part.rotations, whole.rotations[1:3])
+    assert not part.loop and part.joints == whole.joints
+    assert clip.cut(whole, 0.0, None) is whole
+    with pytest.raises(
+        UserError, match="motion.start 0.25 to motion.end 0.3: clip .* has 1 frames"
+    ):
+        clip.cut(whole, 0.25, 0.3)

@@ -3,7 +3,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +16,16 @@ from jaxskills.compilation import jit
 from jaxskills.errors import UserError
 from jaxskills.evaluate import EvaluateConfig, Trace
 from jaxskills.learn import normalize, ppo
+from jaxskills.motion import MotionConfig
 from jaxskills.trainer import TrainState
 
 
 def _trace(fallen: list[list[int]], outside: list[list[int]]) -> Trace:
     """Returns a trace whose rows are episodes."""
     by_step = lambda rows: jnp.asarray(np.array(rows, bool).T)  # noqa: E731
-    nothing = dict.fromkeys(("qpos", "phase", "errors", "sizes", "com", "torque"), jnp.zeros(()))
+    nothing = dict.fromkeys(
+        ("qpos", "phase", "errors", "sizes", "com", "torque", "over"), jnp.zeros(())
+    )
     return Trace(inside=~by_step(outside), fallen=by_step(fallen), **nothing)
 
 
@@ -61,9 +64,9 @@ def _untrained(made: trainer.Trainer) -> TrainState:
     """Returns a state with fresh networks; evaluation needs no more of it."""
     learner = ppo.init(made.config.ppo, made.networks, jax.random.key(0))
     shown = jax.eval_shape(lambda: made.env.observe(made.env.start(jnp.float32(0.0))))
-    nothing: Any = None
-    normalizer = normalize.init(shown.shape[0])
-    return TrainState(learner, normalizer, nothing, nothing, nothing, nothing, nothing)
+    rest = dict.fromkeys(field.name for field in dataclasses.fields(TrainState))
+    parts = {"learner": learner, "normalizer": normalize.init(shown.shape[0])}
+    return TrainState(**(rest | parts))  # pyright: ignore[reportArgumentType]
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +101,29 @@ def test_a_finer_engine_is_another_simulation_of_the_same_length(
     np.testing.assert_allclose(traces[0].com, traces[1].com, atol=0.02)
 
 
+@pytest.mark.parametrize("end", [None, 0.3])
+def test_a_motion_that_is_over_cannot_be_failed(standing: trainer.Trainer, end: float | None):
+    """Leaning by 0.3 rad the walker falls over after about half a second more than 0.8 s."""
+    leaning = clip.load(standing.config.clip)
+    tilt = np.tile([np.cos(0.15), 0.0, np.sin(0.15), 0.0], (31, 1))
+    path = clip.save(
+        dataclasses.replace(leaning, root_rot=tilt), Path(standing.config.clip).parent / "lean.npz"
+    )
+    changed = dataclasses.replace(
+        standing.config, clip=str(path), motion=MotionConfig(end=end, close_loop=0.0)
+    )
+    made = trainer.make(changed)
+    config = EvaluateConfig(3.0, 2, start=0.0)
+    trace = jit(evaluate.make(made, config))(_untrained(made), jax.random.key(1))
+    found = evaluate.summary(trace)
+    over = np.asarray(trace.over)
+    if end is None:
+        assert found["success_rate"] == 0.0 and found["seconds_mean"] > 0.8 and not over.any()
+        return
+    assert found["success_rate"] == 1.0
+    np.testing.assert_array_equal(over.argmax(0), 9 + 15)
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -105,6 +131,7 @@ def test_a_finer_engine_is_another_simulation_of_the_same_length(
         (EvaluateConfig(seconds=4000.0), "seconds is 4000.0: give 1/30 to 3600"),
         (EvaluateConfig(episodes=0), "episodes is 0: give 1 to 65536"),
         (EvaluateConfig(substeps=101), "substeps is 101: give 1 to 100"),
+        (EvaluateConfig(start=1.5), "start is 1.5: give 0 to 1, or none"),
         (EvaluateConfig(substeps=0), "substeps is 0: give 1 to 100"),
     ],
 )

@@ -134,6 +134,7 @@ def evaluate(command: arguments.Evaluate) -> Answer:
         **dataclasses.asdict(config),
         "substeps": config.substeps or made.config.env.substeps,
     }
+    data = {key: value for key, value in data.items() if value is not None}
     lines = [f"{key:20} {value:.4g}" for key, value in data.items()]
     return Answer("\n".join(lines), data)
 

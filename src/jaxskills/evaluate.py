@@ -2,13 +2,15 @@
 """Evaluation: does the skill stand, for how long, and how close to the reference.
 
 As in SB Table 1, bounds do not end an evaluated episode: a fall does, that is any body on the floor
-that the character may not stand on. Actions are the policy's mean, starts are random phases.
+that the character may not stand on. Actions are the policy's mean, starts are random phases. An
+episode of a motion that does not loop is over soon after its end, and cannot fall any more.
 """
 
 import dataclasses
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
@@ -31,6 +33,7 @@ class EvaluateConfig:
     episodes: int = 64
     substeps: int | None = None  # physics steps per control step; None: as in the training
     seed: int = 1
+    start: float | None = None  # share of a cycle at which episodes begin; None: anywhere
 
 
 @struct.dataclass
@@ -43,6 +46,7 @@ class Trace:
     sizes: jax.Array  # [T, E, K] of the bounds
     inside: jax.Array  # [T, E] bool
     fallen: jax.Array  # [T, E] bool, or diverged
+    over: jax.Array  # [T, E] bool, the motion has ended
     com: jax.Array  # [T, E, 3] m
     torque: jax.Array  # [T, E, nu] N m
 
@@ -69,27 +73,37 @@ def make(trainer: Trainer, config: EvaluateConfig) -> Callable[[TrainState, jax.
         trainer.motion,
         config.episodes,
     )
+    if config.start is not None and not 0 <= config.start <= 1:
+        raise UserError(f"start is {config.start}: give 0 to 1, or none")
     steps = round(config.seconds / CONTROL_DT)
-    return lambda state, key: run(env, trainer.networks, state, key, config.episodes, steps)
+
+    def evaluate(state: TrainState, key: jax.Array) -> Trace:
+        share = jax.random.uniform(key, (config.episodes,))
+        if config.start is not None:
+            share = jnp.full(config.episodes, config.start)
+        return run(env, trainer.networks, state, share * env.length, steps)
+
+    return evaluate
 
 
 def run(
-    env: Environment, nets: Networks, state: TrainState, key: jax.Array, episodes: int, steps: int
+    env: Environment, nets: Networks, state: TrainState, phase: jax.Array, steps: int
 ) -> Trace:
-    """Returns the trace of `episodes` from random phases. The key is consumed."""
-    phase = jax.random.uniform(key, (episodes,)) * env.length
+    """Returns the trace of E episodes that begin on the reference at `phase [E]`."""
 
     def advance(now: rollout.Fresh, _: None) -> tuple[rollout.Fresh, Trace]:
         mean = nets.mean(state.learner.policy, normalize.apply(state.normalizer, now.obs))
         states, outcome = jax.vmap(env.step)(now.state, mean)
         report = outcome.report
+        over = states.phase > env.end
         seen = Trace(
             states.sim.qpos,
             states.phase,
             report.errors,
             report.sizes,
-            report.inside,
-            report.fallen | states.sim.diverged,
+            report.inside | over,
+            (report.fallen | states.sim.diverged) & ~over,
+            over,
             report.com,
             report.torque,
         )

@@ -13,7 +13,7 @@ from jaxskills.evaluate import EvaluateConfig, Trace
 from jaxskills.motion import CONTROL_DT
 from jaxskills.trainer import PHASE_BINS, Trainer, TrainState
 
-_AFTER_FALL = 1.0  # s of film after the character has fallen
+_AFTER_FALL = 1.0  # s of film after the character has fallen, or the motion is over
 
 
 def play(made: Trainer, state: TrainState, config: EvaluateConfig) -> Trace:
@@ -26,13 +26,16 @@ def play(made: Trainer, state: TrainState, config: EvaluateConfig) -> Trace:
 
 
 def film(made: Trainer, state: TrainState, path: Path, seconds: float) -> Path:
-    """Films one episode beside its reference, until shortly after a fall; returns `path`.
+    """Films one episode beside its reference, until shortly after its end; returns `path`.
+
+    It begins where the clip begins.
 
     Raises:
       UserError: another suffix than `render.FORMATS`, or nothing to draw with.
     """
-    trace = play(made, state, EvaluateConfig(seconds, episodes=1))
-    until = _lengths(np.asarray(trace.fallen))[0] + round(_AFTER_FALL / CONTROL_DT)
+    trace = play(made, state, EvaluateConfig(seconds, episodes=1, start=0.0))
+    over = np.asarray(trace.fallen | trace.over)
+    until = _lengths(over)[0] + round(_AFTER_FALL / CONTROL_DT)
     qpos = np.asarray(trace.qpos)[:until, 0]
     reference = _reference(made, np.asarray(trace.phase)[:until, 0])
     cycle = made.motion.seconds if made.motion.loop else None
@@ -45,9 +48,10 @@ def played(made: Trainer, trace: Trace) -> plot.Played:
     errors, sizes, inside = (np.asarray(x) for x in (trace.errors, trace.sizes, trace.inside))
     steps, episodes, count = errors.shape
     names = made.env.endings[:count]
-    standing = np.arange(steps)[:, None] < _lengths(np.asarray(trace.fallen))
+    standing = np.arange(steps)[:, None] < _lengths(np.asarray(trace.fallen | trace.over))
     margins = (1.0 - errors / sizes)[standing]
-    phase = np.asarray(trace.phase) % length / length
+    phase = np.asarray(trace.phase) / length
+    phase = phase % 1.0 if made.motion.loop else np.minimum(phase, 1.0)
     grid = np.linspace(0.0, 1.0, 101)
     up = names.index("com_z")
     return plot.Played(

@@ -6,6 +6,7 @@
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -81,7 +82,7 @@ class Trainer(NamedTuple):
 
 def reference(config: TrainConfig, character: Character) -> Motion:
     """Returns the clip of a configuration as a motion of the character."""
-    clip = clip_lib.load(config.clip)
+    clip = clip_lib.cut(clip_lib.load(config.clip), config.motion.start, config.motion.end)
     qpos = retarget.retarget(character, clip)
     return motion_lib.from_qpos(character.model, qpos, clip.times, clip.loop, config.motion)
 
@@ -154,7 +155,11 @@ def make(config: TrainConfig) -> Trainer:
         learner, metrics = ppo_lib.update(config.ppo, nets, state.learner, batch, learn_key)
         flat_obs = steps.obs.reshape(-1, obs_size)
         starts = starts_lib.update(
-            config.starts, state.starts, steps.phase.reshape(-1), batch.target, env.length
+            config.starts,
+            state.starts,
+            within_cycle(env, steps.phase).reshape(-1),
+            batch.target,
+            env.length,
         )
         elites = state.elites
         if elites is not None:
@@ -221,6 +226,12 @@ def visited_states(
     return evolution_lib.Visited(*folded, value)
 
 
+def within_cycle(env: core.Environment, phase: jax.Array) -> jax.Array:
+    """Returns phases moved into [0, length), or held there if the motion does not loop."""
+    last = env.length * (1.0 - 1e-6)
+    return phase % env.length if math.isinf(env.end) else jnp.minimum(phase, last)
+
+
 def episode_metrics(env: core.Environment, steps: rollout.Transition) -> dict[str, jax.Array]:
     """Returns counts of an update, to be summed over updates by whoever shows them.
 
@@ -228,7 +239,7 @@ def episode_metrics(env: core.Environment, steps: rollout.Transition) -> dict[st
     episodes at which phase.
     """
     ended = steps.terminated | steps.truncated
-    place = jnp.floor((steps.phase % env.length) / env.length * PHASE_BINS).astype(jnp.int32)
+    place = jnp.floor(within_cycle(env, steps.phase) / env.length * PHASE_BINS).astype(jnp.int32)
     by_cause = jax.nn.one_hot(steps.ended_by, len(env.endings)) * ended[..., None]
     by_phase = jax.nn.one_hot(jnp.clip(place, 0, PHASE_BINS - 1), PHASE_BINS)
     return {

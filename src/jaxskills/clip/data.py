@@ -113,6 +113,28 @@ def build(
     )
 
 
+def cut(clip: Clip, start: float, end: float | None) -> Clip:
+    """Returns the part of a clip between two times in s, to the frame; a part does not loop.
+
+    Raises:
+      UserError: fewer than two frames are left.
+    """
+    if start == 0.0 and end is None:
+        return clip
+    end = clip.duration if end is None else end
+    kept = (clip.times >= start - 1e-6) & (clip.times <= end + 1e-6)
+    if kept.sum() < 2:
+        raise UserError(
+            f"motion.start {start:g} to motion.end {end:g}: clip '{clip.name}' has"
+            f" {kept.sum()} frames there, it is {clip.duration:.2f} s long"
+        )
+    times = clip.times[kept] - clip.times[kept][0]
+    root = {"root_pos": clip.root_pos[kept], "root_rot": clip.root_rot[kept]}
+    return dataclasses.replace(
+        clip, times=times, rotations=clip.rotations[kept], loop=False, **root
+    )
+
+
 def _check(
     source: str,
     times: np.ndarray,

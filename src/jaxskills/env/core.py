@@ -6,6 +6,7 @@ action is a displacement of the servo targets from the reference (SB fig. 4, FS 
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -99,6 +100,7 @@ class Environment(NamedTuple):
     action_size: int
     endings: tuple[str, ...]  # the K bounds, then `OTHER_ENDINGS`
     length: float  # control frames in a cycle of the reference
+    end: float  # control frames of phase at which an episode is cut off, inf if the motion loops
 
 
 class _Seen(NamedTuple):
@@ -144,7 +146,8 @@ def make(
     dofs = np.array(servos.dofs)
     neutral = jnp.asarray(character.model.qpos0, jnp.float32)
     max_steps = round(config.seconds / CONTROL_DT)
-    last_phase = jnp.inf if motion.loop else motion.length + _HOLD
+    length = float(motion.length)
+    end = math.inf if motion.loop else length + _HOLD
     endings = (*bounds.names, *OTHER_ENDINGS)
 
     def bodies_of(qpos: jax.Array, qvel: jax.Array) -> Bodies:
@@ -235,7 +238,7 @@ def make(
         diverged = sim.diverged | ~jnp.all(jnp.isfinite(errors))
         inside = jnp.all(errors <= sizes) & ~touching & ~diverged
         terminated = fallen | diverged if config.stop == "fall" else ~inside
-        truncated = (state.step >= max_steps) | (state.phase >= last_phase)
+        truncated = (state.step >= max_steps) | (state.phase >= end)
         worst = jnp.argmax(errors / sizes).astype(jnp.int32)
         others = len(bounds.names) + jnp.arange(len(OTHER_ENDINGS), dtype=jnp.int32)
         by_bound = jnp.where(jnp.any(errors > sizes), worst, others[0])
@@ -261,8 +264,7 @@ def make(
         )
         return state, outcome
 
-    length = float(motion.length)
-    return Environment(start, place, observe_state, step, len(dofs), endings, length)
+    return Environment(start, place, observe_state, step, len(dofs), endings, length, end)
 
 
 def validate(config: EnvConfig) -> None:

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's comparisons, each one command: the same skill trained in several ways.
+
+    python experiments/compare.py backflip_starts [--runs runs]
+
+Records and film strips are written to `experiments/results/NAME/`; a case whose record is there is
+left out, a run that was cut off goes on. `experiments/tables.py` makes the tables of
+`experiments/README.md`, which says what each comparison is for and what it costs.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from reproduce import RESULTS, keep, reproduce
+
+
+class Case(NamedTuple):
+    """One training of a comparison."""
+
+    skill: str
+    options: tuple[str, ...] = ()  # of `jaxskills train`, besides the recipe's
+
+
+def _of(text: str) -> tuple[str, ...]:
+    return tuple(text.split())
+
+
+# Beside the paper's names, how DeepMimic differs: its reward, its end of an episode, its starts,
+# and a policy without feed-forward.
+_IMITATION = "--env.reward imitation --env.stop fall"
+_DEEPMIMIC = f"{_IMITATION} --starts.uniform 1 --env.no-feedforward"
+_TIGHT = "--bounds.com 0.15 0.15 0.1 --bounds.root 0.35 --bounds.joints 0.35"
+_LOOSE = "--bounds.com 0.6 0.6 0.4 --bounds.root 1.4 --bounds.joints 1.4"
+
+
+def _poor(skill: str, samples: int) -> dict[str, Case]:
+    most = f"--samples {samples} "
+    return {
+        "bounds": Case(skill, _of(most)),
+        "bounds_imitation": Case(skill, _of(most + "--env.reward imitation")),
+        "imitation": Case(skill, _of(most + _IMITATION)),
+        "deepmimic": Case(skill, _of(most + _DEEPMIMIC + " --evolution.no-enabled")),
+    }
+
+
+def _styles(skill: str, samples: int) -> dict[str, Case]:
+    """The styles of SB 5.3.1; a recipe for styles has loose bounds, and is plain without one."""
+    most = f"--samples {samples} --no-stop-when-learnt"
+    cases = {"plain": Case(skill, _of(most))}
+    for style in ("energy_up", "energy_down", "volume_up", "volume_down"):
+        reward = f" --env.reward style --env.style.style {style}"
+        cases[style] = Case(skill, _of(most + reward))
+    return cases
+
+
+def _blends(skill: str, style: str, samples: int) -> dict[str, Case]:
+    """SB Table 2: no bounds, imitation and style weighted."""
+    how = f"--samples {samples} --no-stop-when-learnt --env.reward blend --env.stop fall"
+    return {
+        f"weight_{weight}": Case(
+            skill, _of(f"{how} --env.style.style {style} --env.style-weight {weight}")
+        )
+        for weight in (0.5, 0.6, 0.7, 0.8)
+    }
+
+
+COMPARISONS: dict[str, dict[str, Case]] = {
+    "backflip_starts": {
+        "importance": Case("backflip", _of("--samples 20000000")),
+        "uniform": Case("backflip", _of("--samples 20000000 --starts.uniform 1")),
+    },
+    "break_dance_evolution": {
+        "on": Case("break_dance", _of("--samples 6000000")),
+        "off": Case("break_dance", _of("--samples 6000000 --evolution.no-enabled")),
+    },
+    "feedforward": {
+        "with": Case("walk", _of("--samples 4000000")),
+        "without": Case("walk", _of("--samples 4000000 --env.no-feedforward")),
+    },
+    "walk_bounds": {
+        "tight": Case("walk", _of(f"--samples 4000000 {_TIGHT} --bounds.end-effectors 0.25")),
+        "default": Case("walk", _of("--samples 4000000")),
+        "loose": Case("walk", _of(f"--samples 4000000 {_LOOSE} --bounds.end-effectors 1")),
+    },
+    "cartwheel_bounds": {
+        "tight": Case("cartwheel", _of(f"--samples 12000000 {_TIGHT} --bounds.end-effectors 0.25")),
+        "default": Case("cartwheel", _of("--samples 12000000")),
+        "loose": Case("cartwheel", _of(f"--samples 12000000 {_LOOSE} --bounds.end-effectors 1")),
+    },
+    "sparse_jog": _poor("sparse_jog", 3_000_000),
+    "cartwheel_styles": _styles("cartwheel_style", 8_000_000),
+    "dance_styles": _styles("dance_style", 6_000_000),
+    "cartwheel_blend": _blends("cartwheel", "energy_down", 8_000_000),
+}
+
+
+def main() -> None:
+    """Trains the cases that are not there yet."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("names", nargs="+", choices=COMPARISONS)
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="where run folders go")
+    options = parser.parse_args()
+    for name in options.names:
+        for label, case in COMPARISONS[name].items():
+            if (RESULTS / name / f"{label}.json").is_file():
+                print(f"{name}/{label} is there", file=sys.stderr)
+                continue
+            run = options.runs / name / label
+            keep(reproduce(case.skill, 0, run, case.options), run, RESULTS / name, label)
+
+
+if __name__ == "__main__":
+    main()
