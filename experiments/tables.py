@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints the tables of the README from the JSON files of both `results/` folders.
+"""Prints the tables of both READMEs from the JSON files of both `results/` folders.
 
-    python experiments/tables.py [--write README.md]
+    python experiments/tables.py [--write README.md experiments/README.md]
 
-With --write, the part of the file between the two `tables.py` comments is replaced.
+With --write, the parts of the files between two `tables.py` comments are replaced: `<!-- tables.py
+trainings -->`, or the name of another page below.
 """
 
 import argparse
@@ -14,8 +15,18 @@ from typing import Any
 
 RESULTS = Path(__file__).parent / "results"
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks" / "results"
-BLOCK = re.compile(r"(<!-- tables\.py -->\n).*?(<!-- end of tables\.py -->)", re.DOTALL)
-PAPER = {"walk": 4.08e6, "run": 4.11e6}  # samples, SB Table 1
+BLOCK = re.compile(r"(<!-- tables\.py (\w+) -->\n).*?(<!-- end of tables\.py -->)", re.DOTALL)
+PAPER = {  # samples, SB Table 1
+    "walk": 4.08e6,
+    "run": 4.11e6,
+    "jump": 41.63e6,
+    "roll": 12.31e6,
+    "cartwheel": 17.35e6,
+    "dance": 10.00e6,
+    "run_jump": 11.02e6,
+    "backflip": 41.20e6,
+}
+_PASSED = 0.95  # of evaluated episodes, to count as learnt
 
 _HEAD = (
     "| skill | seed | samples | paper's | minutes | 20 s without a fall | at 600 Hz physics |",
@@ -68,25 +79,69 @@ def speed(physics: dict[str, Any], train: dict[str, Any]) -> str:
     return "\n".join(["| speed | |", "|---|---|", *lines])
 
 
-def page() -> str:
-    """Returns all tables."""
+def comparison(cases: dict[str, dict[str, Any]]) -> str:
+    """Returns the table of a comparison: one line for each label's record."""
+    heads = ["case", "samples", "95 % first after", "minutes", "20 s without a fall", "mean time"]
+    cells = [[label, *_measured(record)] for label, record in cases.items()]
+    for name, (head, form) in _STYLES.items():
+        if any(name in (record["evaluate"] or {}) for record in cases.values()):
+            heads.append(head)
+            for row, record in zip(cells, cases.values(), strict=True):
+                value = (record["evaluate"] or {}).get(name)
+                row.append("" if value is None else form.format(value))
+    lines = [heads, ["---"] * len(heads), *cells]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+_STYLES = {
+    "energy_mean": ("energy, J", "{:.1f}"),
+    "volume_mean": ("hull volume, l", "{:.1f}"),
+    "gram_distance_mean": ("Gram distance", "{:.3g}"),
+}
+
+
+def _measured(record: dict[str, Any]) -> list[str]:
+    passed = [row for row in record["curve"] if row.get("success_rate", 0.0) >= _PASSED]
+    found = record["evaluate"]
+    return [
+        f"{record['samples'] / 1e6:.2f} M",
+        f"{passed[0]['samples'] / 1e6:.2f} M" if passed else "never",
+        f"{record['wall_s'] / 60:.0f}",
+        f"{found['success_rate']:.0%} of {found['episodes']}" if found else "failed",
+        f"{found['seconds_mean']:.1f} s" if found else "",
+    ]
+
+
+def trainings() -> str:
+    """Returns the tables of trainings and of speed."""
     benchmarks = [json.loads((BENCHMARKS / f"{n}.json").read_text()) for n in ("physics", "train")]
     return f"{table(records(RESULTS))}\n\n{speed(*benchmarks)}"
+
+
+def comparisons() -> str:
+    """Returns a table for each folder of results, in order of the alphabet."""
+    tables = []
+    for folder in sorted(path for path in RESULTS.iterdir() if path.is_dir()):
+        cases = {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
+        tables.append(f"**{folder.name}**\n\n{comparison(cases)}")
+    return "\n\n".join(tables) or "None yet."
+
+
+PAGES = {"trainings": trainings, "comparisons": comparisons}
 
 
 def main() -> None:
     """Prints or writes."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--write", type=Path)
+    parser.add_argument("--write", type=Path, nargs="+", default=[])
     options = parser.parse_args()
-    text = page()
-    if options.write is None:
-        print(text)
-        return
-    before = options.write.read_text()
-    if not BLOCK.search(before):
-        parser.error(f"{options.write} has no line <!-- tables.py -->")
-    options.write.write_text(BLOCK.sub(lambda found: f"{found[1]}{text}\n{found[2]}", before))
+    if not options.write:
+        print("\n\n".join(make() for make in PAGES.values()))
+    for path in options.write:
+        before = path.read_text()
+        if not BLOCK.search(before):
+            parser.error(f"{path} has no line <!-- tables.py PAGE -->")
+        path.write_text(BLOCK.sub(lambda found: f"{found[1]}{PAGES[found[2]]()}\n{found[3]}", before))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from types import ModuleType
 import jax
 import pytest
 
-from jaxskills import physics, provenance
+from jaxskills import cli, physics, provenance, trainer
 
 ROOT = Path(__file__).parents[1]
 
@@ -48,10 +48,35 @@ def test_records_come_in_order(tmp_path: Path):
     assert [(r["skill"], r["seed"]) for r in found] == [("run", 1), ("walk", 9), ("walk", 10)]
 
 
-def test_the_readme_shows_the_records():
+@pytest.mark.parametrize("readme", ["README.md", "experiments/README.md"])
+def test_the_readme_shows_the_records(readme: str):
     tables = script("tables")
-    block = tables.BLOCK.search((ROOT / "README.md").read_text())
-    assert block and tables.page() in block[0]
+    block = tables.BLOCK.search((ROOT / readme).read_text())
+    assert block and tables.PAGES[block[2]]() in block[0]
+
+
+def test_a_comparison_table():
+    curve = [{"samples": 1e6, "success_rate": 0.5}, {"samples": 2e6, "success_rate": 0.97}]
+    found = {"success_rate": 0.984375, "episodes": 64, "seconds_mean": 19.5}
+    cases = {
+        "with": RECORD | {"curve": curve, "evaluate": found | {"energy_mean": 61.23}},
+        "without": RECORD | {"curve": curve[:1], "evaluate": found},
+    }
+    lines = script("tables").comparison(cases).splitlines()
+    assert lines[0].endswith("| mean time | energy, J |")
+    assert lines[2] == "| with | 1.23 M | 2.00 M | 2 | 98% of 64 | 19.5 s | 61.2 |"
+    assert lines[3] == "| without | 1.23 M | never | 2 | 98% of 64 | 19.5 s |  |"
+
+
+def test_each_comparison_can_be_trained(monkeypatch: pytest.MonkeyPatch):
+    """Its skills are recipes, and its options are options of `train`."""
+    monkeypatch.syspath_prepend(ROOT / "experiments")
+    for name, cases in script("compare").COMPARISONS.items():
+        for label, case in cases.items():
+            command = ["train", case.skill, "--out", "nowhere", *case.options]
+            _, config = cli.parse(command)
+            assert config.samples < 50e6, (name, label)
+            trainer.validate(config)
 
 
 @pytest.mark.parametrize("count", [1, 39, 40, 1000])

@@ -35,7 +35,7 @@ _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns its exit code: 0, 2 for bad input, 130 after Ctrl-C."""
     try:
-        return _perform(*_parse(list(sys.argv[1:] if argv is None else argv)))
+        return _perform(*parse(list(sys.argv[1:] if argv is None else argv)))
     except UserError as error:
         return _refuse(str(error))
     except BrokenPipeError:  # the reader of our output has seen enough, as in `... | head`
@@ -57,7 +57,7 @@ def _refuse(message: str) -> int:
     return BAD_INPUT
 
 
-def _parse(typed: list[str]) -> tuple[Any, Any]:
+def parse(typed: list[str]) -> tuple[Any, Any]:
     """Returns the command, one of `arguments`, and the settings if it is `train`."""
     if typed[:1] == ["train"]:
         return _parse_train(typed[1:])
