@@ -141,7 +141,11 @@ def main() -> None:
         before = path.read_text()
         if not BLOCK.search(before):
             parser.error(f"{path} has no line <!-- tables.py PAGE -->")
-        path.write_text(BLOCK.sub(lambda found: f"{found[1]}{PAGES[found[2]]()}\n{found[3]}", before))
+        path.write_text(BLOCK.sub(_filled, before))
+
+
+def _filled(block: re.Match[str]) -> str:
+    return f"{block[1]}{PAGES[block[2]]()}\n{block[3]}"
 
 
 if __name__ == "__main__":

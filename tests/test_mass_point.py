@@ -2,12 +2,17 @@
 """Feasible regions of the mass point, against what can be worked out by hand."""
 
 import importlib.util
+import json
+import sys
+import warnings
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
 
-_PATH = Path(__file__).parents[1] / "experiments" / "mass_point.py"
+_FOLDER = Path(__file__).parents[1] / "experiments"
+_PATH = _FOLDER / "mass_point.py"
 _SPEC = importlib.util.spec_from_file_location("mass_point", _PATH)
 assert _SPEC and _SPEC.loader
 mass_point = importlib.util.module_from_spec(_SPEC)
@@ -57,3 +62,20 @@ def test_bounds_are_kept_and_every_event_goes_on():
 def test_each_bound_shrinks_the_region():
     volumes = [mass_point.feasible(bounds, 30).volume for bounds in mass_point.CASES.values()]
     assert volumes[0] > 1.8 * volumes[1] > 1.8 * 3.0 * volumes[2]
+
+
+def test_the_notebook_runs_and_prints_what_it_shows(monkeypatch: pytest.MonkeyPatch, capsys):
+    """Its cells, one after the other; what they print is what is kept in it."""
+    folder = _FOLDER / "notebooks"
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    cells = json.loads((folder / "mass_point.ipynb").read_text())["cells"]
+    cells = [cell for cell in cells if cell["cell_type"] == "code"]
+    scope: dict = {}
+    with matplotlib.rc_context({"backend": "agg"}), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a picture cannot be shown
+        for cell in cells:
+            exec("".join(cell["source"]), scope)
+    kept = [out["text"] for cell in cells for out in cell["outputs"] if "text" in out]
+    shown = "".join(text if isinstance(text, str) else "".join(text) for text in kept)
+    assert capsys.readouterr().out == shown

@@ -86,9 +86,7 @@ def make(trainer: Trainer, config: EvaluateConfig) -> Callable[[TrainState, jax.
     return evaluate
 
 
-def run(
-    env: Environment, nets: Networks, state: TrainState, phase: jax.Array, steps: int
-) -> Trace:
+def run(env: Environment, nets: Networks, state: TrainState, phase: jax.Array, steps: int) -> Trace:
     """Returns the trace of E episodes that begin on the reference at `phase [E]`."""
 
     def advance(now: rollout.Fresh, _: None) -> tuple[rollout.Fresh, Trace]:
