@@ -66,21 +66,31 @@ def test_segments_are_drawn_as_often_as_they_should_and_evenly_inside():
 
 def test_running_averages_by_hand():
     """Segments of 10 frames, memory 0.75. First means as they are, later ones blended."""
-    config = StartsConfig(segments=3, memory=0.75)
+    config, every = StartsConfig(segments=3, memory=0.75), jnp.ones(3, bool)
     phase, returns = jnp.array([1.0, 9.0, 12.0]), jnp.array([4.0, 8.0, 5.0])
-    first = starts.update(config, starts.init(config), phase, returns, 30.0)
+    first = starts.update(config, starts.init(config), phase, returns, every, 30.0)
     np.testing.assert_allclose(first.returns, [6.0, 5.0, 0.0], rtol=1e-6)
     assert first.seen.tolist() == [True, True, False]
-    # 0.75 * 6 + 0.25 * 2; the second segment is not visited; the third for the first time.
-    later = starts.update(config, first, jnp.array([3.0, 25.0]), jnp.array([2.0, 7.0]), 30.0)
-    np.testing.assert_allclose(later.returns, [5.0, 5.0, 7.0], rtol=1e-6)
-    assert later.seen.tolist() == [True, True, True]
+    # 0.75 * 6 + 0.25 * 2; two episodes begun in the second: 0.75^2 * 5 + (1 - 0.75^2) * 3.
+    phase, returns = jnp.array([3.0, 12.0, 18.0]), jnp.array([2.0, 1.0, 5.0])
+    later = starts.update(config, first, phase, returns, every, 30.0)
+    np.testing.assert_allclose(later.returns, [5.0, 4.125, 0.0], rtol=1e-6)
+
+
+def test_only_what_an_episode_begins_with_counts():
+    config = StartsConfig(segments=2, memory=0.5)
+    before = starts.Starts(jnp.array([8.0, 8.0]), jnp.ones(2, bool))
+    phase, returns = jnp.array([1.0, 2.0, 12.0, 13.0]), jnp.array([2.0, 50.0, 50.0, 50.0])
+    first = jnp.array([True, False, False, False])
+    after = starts.update(config, before, phase, returns, first, 20.0)
+    np.testing.assert_allclose(after.returns, [5.0, 8.0], rtol=1e-6)
 
 
 def test_later_cycles_fall_into_the_same_segments():
     config = StartsConfig(segments=3)
     phase = jnp.array([35.0, 30.0 + 15.0, 300.0 + 29.9])
-    found = starts.update(config, starts.init(config), phase, jnp.array([1.0, 2.0, 3.0]), 30.0)
+    returns = jnp.array([1.0, 2.0, 3.0])
+    found = starts.update(config, starts.init(config), phase, returns, jnp.ones(3, bool), 30.0)
     np.testing.assert_allclose(found.returns, [1.0, 2.0, 3.0], rtol=1e-6)
 
 

@@ -159,6 +159,7 @@ def make(config: TrainConfig) -> Trainer:
             state.starts,
             within_cycle(env, steps.phase).reshape(-1),
             batch.target,
+            (steps.state.step == 0).reshape(-1),
             env.length,
         )
         elites = state.elites

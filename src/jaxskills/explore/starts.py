@@ -16,15 +16,15 @@ class StartsConfig:
 
     segments: int = 10
     uniform: float = 0.2  # u of SB eq. 11, the share that stays uniform
-    memory: float = 0.9  # of the running average of a segment's return
+    memory: float = 0.9  # of the running average of a segment's return, for each start seen there
 
 
 @struct.dataclass
 class Starts:
     """What is known of the S segments."""
 
-    returns: jax.Array  # [S] running average of the estimated return from there
-    seen: jax.Array  # [S] bool, a state in this segment was visited at all
+    returns: jax.Array  # [S] running average of the estimated return of episodes begun there
+    seen: jax.Array  # [S] bool, an episode began in this segment at all
 
 
 def init(config: StartsConfig) -> Starts:
@@ -64,14 +64,33 @@ def sample_segments(config: StartsConfig, starts: Starts, key: jax.Array, count:
 
 
 def update(
-    config: StartsConfig, starts: Starts, phase: jax.Array, returns: jax.Array, length: float
+    config: StartsConfig,
+    starts: Starts,
+    phase: jax.Array,
+    returns: jax.Array,
+    first: jax.Array,
+    length: float,
 ) -> Starts:
-    """Returns the segments with estimated `returns [M]` from states at `phase [M]` taken in."""
+    """Returns the segments with what the episodes tell that were begun.
+
+    Only the states that episodes begin with count. On the way through a segment a controller that
+    has been on its way for a while is safe where one that begins there may fall.
+
+    Args:
+      config: how.
+      starts: before.
+      phase: `[M]` control frames of the visited states.
+      returns: `[M]` estimated from there.
+      first: `[M]` bool, the state is the first of its episode.
+      length: control frames in a cycle.
+    """
     place = jnp.floor((phase % length) / length * config.segments).astype(jnp.int32)
     member = jax.nn.one_hot(jnp.clip(place, 0, config.segments - 1), config.segments)
+    member = member * first[:, None]
     count = jnp.sum(member, axis=0)
     mean = returns @ member / jnp.maximum(count, 1.0)
-    blended = config.memory * starts.returns + (1.0 - config.memory) * mean
+    kept = config.memory**count
+    blended = kept * starts.returns + (1.0 - kept) * mean
     fresh = jnp.where(starts.seen, blended, mean)
     return Starts(jnp.where(count > 0, fresh, starts.returns), starts.seen | (count > 0))
 
