@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from jaxskills import clip
+from jaxskills import character, check, clip
 from jaxskills.clip import keyframes
 from jaxskills.clip.keyframes import Key, Keyframes
 from jaxskills.errors import UserError
+from jaxskills.retarget import hinges
 
 TOML = """
 loop = false
@@ -144,13 +146,44 @@ def test_toml_refusals(tmp_path: Path, old: str, new: str, said: str):
     assert "\n" not in str(error.value) and "bad" in str(error.value)
 
 
-def test_shipped_jog():
-    one = clip.load("sparse_jog")
-    assert one.loop and one.duration == pytest.approx(0.72)
-    assert "6 key poses, linear in between" in one.notes
-    # Its second half mirrors the first: sides exchanged, turns about x and z negated.
-    middle = (len(one.times) - 1) // 2
+JOGS = {"sparse_jog": 6, "sparse_high_knees": 4, "sparse_backward_jog": 5}
+
+
+@pytest.mark.parametrize(("name", "poses"), JOGS.items())
+def test_shipped_jogs_are_poor_but_sound(name: str, poses: int):
+    """Key poses joined by straight lines that float and sink; yet no joint is misread."""
+    one, who = clip.load(name), character.load("humanoid34")
+    report = check.check(who, one)
+    assert one.loop and f"{poses} key poses, linear in between" in one.notes
+    assert report.ok and report.numbers["loop_gap"] == pytest.approx(0.0, abs=1e-3)
+    assert -0.05 < report.numbers["floor_lowest"] < -0.01  # sinks
+    assert 0.03 < report.numbers["floor_highest"] < 0.08  # floats
+    assert not [f for f in report.findings if f.code in ("limits", "spike")]
+
+
+@pytest.mark.parametrize("name", JOGS)
+def test_shipped_jogs_bend_and_swing_the_human_way(name: str):
+    """Shins swing back, forearms forward, each arm goes with the other side's leg."""
+    one = clip.load(name)
+
+    def forward(joint: str) -> np.ndarray:
+        turns = Rotation.from_quat(one.rotations[:, one.joints.index(joint)], scalar_first=True)
+        return -hinges.twist(turns, np.array([0.0, 1.0, 0.0]))
+
+    for side, other in (("left", "right"), ("right", "left")):
+        assert forward(f"{side}_knee").max() < 0.0 < forward(f"{side}_elbow").min()
+        leg, arm, far_arm = (
+            forward(f"{s}_{j}") for s, j in ((side, "hip"), (side, "shoulder"), (other, "shoulder"))
+        )
+        assert np.corrcoef(leg, far_arm)[0, 1] > 0.5 > -0.5 > np.corrcoef(leg, arm)[0, 1]
+
+
+@pytest.mark.parametrize("name", ["sparse_jog", "sparse_high_knees"])
+def test_shipped_jogs_are_the_same_on_both_sides(name: str):
+    """The second half mirrors the first: sides exchanged, turns about x and z negated."""
+    one = clip.load(name)
+    frames = (len(one.times) - 1) // 2
     left, right = one.joints.index("left_hip"), one.joints.index("right_hip")
-    assert one.rotations[middle, left] == pytest.approx(
+    assert one.rotations[frames, left] == pytest.approx(
         one.rotations[0, right] * [1, -1, 1, -1], abs=1e-9
     )

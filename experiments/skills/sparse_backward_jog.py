@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SB fig. 7: jogging backwards from five key poses, a poor reference: starts evolve."""
+
+from jaxskills.explore.evolution import EvolutionConfig
+from jaxskills.recipes import Recipe
+from jaxskills.trainer import TrainConfig
+
+RECIPE = Recipe(
+    name="sparse_backward_jog",
+    clip="sparse_backward_jog",
+    note="Authored here, 0.70 s a cycle. SB fig. 7.",
+    config=TrainConfig(evolution=EvolutionConfig(enabled=True)),
+)
