@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recipes are found by name, by file, or made for a clip."""
+"""Recipes are found by name, by file, or made for a clip; the shipped ones fit their clips."""
 
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 
-from jaxskills import recipes
+from jaxskills import character, clip, commands, recipes, retarget, trainer
 from jaxskills.errors import UserError
 from jaxskills.recipes import Recipe
 
@@ -14,6 +16,38 @@ from jaxskills.recipes import Recipe
 def test_shipped_recipes_are_named_after_their_file(name: str):
     recipe = recipes.find(name)
     assert (recipe.name, bool(recipe.note)) == (name, True)
+
+
+@pytest.mark.parametrize("name", recipes.names())
+def test_shipped_recipes_fit_their_clips(name: str):
+    """The heading axis stays off the vertical, and what is in the floor may touch it."""
+    config = commands.settings(recipes.find(name))
+    trainer.validate(config)
+    try:
+        motion = clip.load(config.clip)
+    except UserError as missing:
+        pytest.skip(str(missing))
+    who = character.load(config.character)
+    side = config.env.heading == "lateral"
+    axis = np.cross([0.0, 0.0, 1.0], who.forward) if side else who.forward
+    allowed = who.ground if config.env.may_touch is None else config.env.may_touch
+    model, data = who.model, mujoco.MjData(who.model)
+    floor, pairs = model.geom("floor").id, zip(model.pair_geom1, model.pair_geom2, strict=True)
+    geoms = [b if a == floor else a for a, b in pairs if floor in (a, b)]
+    others = [g for g in geoms if model.body(model.geom_bodyid[g]).name not in allowed]
+    assert len(others) < len(geoms)
+    for pose in retarget.retarget(who, motion)[::2]:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        assert np.linalg.norm((data.xmat[1].reshape(3, 3) @ axis)[:2]) > 0.4
+        for geom in others:
+            assert mujoco.mj_geomDistance(model, data, floor, geom, 1.0, None) > -0.01
+
+
+@pytest.mark.parametrize("name", ["atlas_walk", "sparse_backward_jog", "spin"])
+def test_shipped_recipes_make_trainers(name: str, deepmimic: Path):
+    made = trainer.make(commands.settings(recipes.find(name)))
+    assert made.motion.loop and made.env.action_size == len(made.character.actuated)
 
 
 def test_the_walk_and_the_run_are_there():
@@ -27,7 +61,7 @@ def test_a_clip_file_gets_the_default_settings(tmp_path: Path):
 
 
 def test_a_clip_name_gets_the_default_settings(deepmimic: Path):
-    assert recipes.find("spin") == Recipe("spin", "spin")
+    assert recipes.find("dance_b") == Recipe("dance_b", "dance_b")
     assert recipes.find("walker/turn_left0") == Recipe("turn_left0", "walker/turn_left0")
 
 
@@ -43,7 +77,7 @@ def test_a_recipe_file(tmp_path: Path):
 @pytest.mark.parametrize(
     ("skill", "message"),
     [
-        ("wlak", "unknown skill 'wlak': choose one of run, walk, "),
+        ("wlak", f"unknown skill 'wlak': choose one of {', '.join(recipes.names())}, a name of "),
         ("none.py", "recipe file 'none.py' does not exist"),
         ("none.bvh", "clip 'none.bvh' does not exist"),
     ],
