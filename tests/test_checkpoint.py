@@ -5,11 +5,14 @@ import dataclasses
 import errno
 import json
 from pathlib import Path
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import tiny
+from flax import struct
 
 from jaxskills import checkpoint, trainer
 from jaxskills.env.bounds import BoundsConfig
@@ -107,6 +110,34 @@ def test_a_checkpoint_of_other_settings_is_refused(
     checkpoint.save(tmp_path, state, 64)
     other = trainer.make(dataclasses.replace(made.config, **changes))
     assert "is damaged or of other settings" in _refused(tmp_path, other)
+
+
+@struct.dataclass
+class _Younger:
+    """A state that has got one more part since."""
+
+    known: jax.Array
+    added: jax.Array | None = None
+
+
+@struct.dataclass
+class _Older:
+    known: jax.Array
+
+
+def test_a_state_from_before_an_optional_part_is_read(made: Trainer, tmp_path: Path):
+    checkpoint.save(tmp_path, cast(Any, _Older(jnp.arange(3.0))), 32)
+    now = made._replace(init=cast(Any, lambda key: _Younger(jnp.zeros(3))))
+    found = cast(Any, checkpoint.restore(tmp_path, now))
+    assert found.added is None
+    np.testing.assert_array_equal(found.known, [0.0, 1.0, 2.0])
+    for other, says in (
+        (lambda key: _Younger(jnp.zeros(3), jnp.zeros(2)), "(added is missing)"),
+        (lambda key: _Younger(jnp.zeros(4)), "(known has shape (3,) instead of (4,))"),
+    ):
+        assert says in _refused(tmp_path, made._replace(init=cast(Any, other)))
+    checkpoint.save(tmp_path, cast(Any, _Younger(jnp.zeros(3), jnp.zeros(2))), 64)
+    assert "(added is not wanted)" in _refused(tmp_path, now)
 
 
 def test_a_configuration_is_read_as_it_was_written(tmp_path: Path):

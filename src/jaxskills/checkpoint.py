@@ -72,8 +72,7 @@ def restore(run: Path, trainer: Trainer) -> TrainState:
     here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     target = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), shapes)
     try:
-        with ocp.StandardCheckpointer() as reader:
-            return reader.restore(path, target)
+        return _read(path, target)
     except Exception as error:  # orbax raises many kinds for missing, cut off or reshaped arrays
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         remedy = (
@@ -82,6 +81,34 @@ def restore(run: Path, trainer: Trainer) -> TrainState:
         raise UserError(
             f"checkpoint '{path}' is damaged or of other settings ({reason}): {remedy}"
         ) from None
+
+
+def _read(path: Path, target: TrainState) -> TrainState:
+    """Returns the state saved at `path`, in the shapes of `target`.
+
+    Optional parts that neither has (None) need not be mentioned there: they may be younger.
+
+    Raises:
+      Exception: of many kinds, for missing, cut off or reshaped arrays.
+    """
+    with ocp.StandardCheckpointer() as reader:
+        tree = reader.metadata(path).item_metadata.tree  # pyright: ignore
+    saved = {leaf.name: leaf.shape for leaf in jax.tree.leaves(tree)}
+    named = {".".join(names): leaf for names, leaf in ocp.tree.to_flat_dict(target).items()}
+    asked = {name: leaf for name, leaf in named.items() if leaf is not None}
+    for name in sorted(saved.keys() ^ asked.keys()):
+        raise ValueError(f"{name} is {'not wanted' if name in saved else 'missing'}")
+    for name, leaf in asked.items():
+        is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        if leaf.shape != saved[name] and not is_key:
+            raise ValueError(f"{name} has shape {saved[name]} instead of {leaf.shape}")
+    how = ocp.args.PyTreeRestore(
+        target,
+        restore_args=ocp.checkpoint_utils.construct_restore_args(target),
+        partial_restore=True,
+    )
+    with ocp.PyTreeCheckpointer() as reader:
+        return reader.restore(path, args=how)
 
 
 def write_config(run: Path, config: TrainConfig) -> None:
