@@ -144,6 +144,49 @@ def test_sizes_are_linear_between_knots_of_phase(who: Character):
     np.testing.assert_allclose(_sizes(made, 11.0)[0], 0.3, rtol=1e-6)
 
 
+def test_knots_in_any_places_are_met(who: Character):
+    """0.35 and 1/3 lie on sixtieths of the cycle; the evenly spread one on thirds."""
+    config = BoundsConfig(
+        channels={
+            "com_z": ((0.0, 0.2), (0.35, 0.5), (1.0, 0.2)),
+            "root": ((1 / 3, 1.0), (0.75, 0.4)),
+            "spine": (0.1, 0.4, 0.1, 0.7),
+        }
+    )
+    made = bounds.make(who, config)
+    assert made.sizes.shape == (61, 10)
+    place = {name: NAMES.index(name) for name in ("com_x", "com_z", "root", "spine")}
+    for share, expected in (
+        (0.0, (0.3, 0.2, 1.0, 0.1)),
+        (0.175, (0.3, 0.35, 1.0, 0.2575)),
+        (0.35, (0.3, 0.5, 0.976, 0.385)),
+        (0.75, (0.3, 0.2 + 0.3 * 0.25 / 0.65, 0.4, 0.25)),
+        (0.99, (0.3, 0.2 + 0.3 * 0.01 / 0.65, 0.4, 0.682)),
+    ):
+        found = _sizes(made, 30.0 * share)[list(place.values())]
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_knots_that_no_even_steps_meet_are_met_within_half_a_percent(who: Character):
+    made = bounds.make(who, BoundsConfig(channels={"root": ((0.0, 1.0), (0.123456, 2.0))}))
+    assert made.sizes.shape == (201, 10)
+    root = NAMES.index("root")
+    for share in np.linspace(0.0, 0.999, 50):
+        expected = np.interp(share, [0.0, 0.123456], [1.0, 2.0])
+        # The slope is 1 / 0.123, and a chord between steps of 0.005 is at most a quarter off.
+        assert abs(_sizes(made, 30.0 * share)[root] - expected) < 0.005 / 4 / 0.123 + 1e-4
+
+
+def test_an_infinite_size_is_no_bound_beside_knots_either(who: Character):
+    channels = {"com_x": float("inf"), "root": ((0.0, 0.2), (1.0, 0.4))}
+    for config in (
+        BoundsConfig(channels=channels),
+        BoundsConfig(channels={"com_x": float("inf")}),
+    ):
+        found = _sizes(bounds.make(who, config), 11.0)
+        assert np.isfinite(found).all() and found[0] > 1e5 and (found[1:] < 1.0).all()
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -156,6 +199,14 @@ def test_sizes_are_linear_between_knots_of_phase(who: Character):
         (BoundsConfig(channels={"root": (0.1, -1.0)}), "bound root is (0.1, -1.0): give positive"),
         (BoundsConfig(channels={"root": float("nan")}), "bound root is nan: give positive"),
         (BoundsConfig(channels={"root": ()}), "bound root is (): give"),
+        (
+            BoundsConfig(channels={"root": ((0.5, 0.2), (0.5, 0.3))}),
+            "bound root has knots at 0.5, 0.5: give shares of the cycle that rise from 0 to 1",
+        ),
+        (BoundsConfig(channels={"root": ((0.5, 0.2), (0.4, 0.3))}), "bound root has knots at 0.5"),
+        (BoundsConfig(channels={"root": ((0.0, 0.2), (1.1, 0.3))}), "bound root has knots at 0, 1"),
+        (BoundsConfig(channels={"root": ((-0.1, 0.2),)}), "bound root has knots at -0.1"),
+        (BoundsConfig(channels={"root": ((0.0, 0.2), (1.0, 0.0))}), "bound root is ((0.0, 0.2),"),
         (BoundsConfig(com=(0.3, -0.3, 0.2)), "bound com_y is -0.3: give positive sizes"),
         (BoundsConfig(joints=-1.0), "bound spine is -1.0: give positive sizes"),
         (

@@ -159,7 +159,12 @@ def test_a_configuration_is_read_as_it_was_written(tmp_path: Path):
 
 
 def test_sizes_over_phase_are_read_as_they_were_written(tmp_path: Path):
-    config = TrainConfig(bounds=BoundsConfig(channels={"root": (0.4, 0.9), "com_x": 0.2}))
+    knots = ((0.0, 0.2), (0.35, 0.5))
+    config = TrainConfig(
+        bounds=BoundsConfig(
+            channels={"root": (0.4, 0.9), "com_x": 0.2, "com_y": float("inf"), "com_z": knots}
+        )
+    )
     checkpoint.write_config(tmp_path, config)
     assert checkpoint.read_config(tmp_path) == config
 

@@ -10,13 +10,16 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import tiny
 
-from jaxskills import checkpoint, commands, progress
+from jaxskills import checkpoint, commands, progress, trainer
 from jaxskills.cli import main
+from jaxskills.env.bounds import BoundsConfig
+from jaxskills.trainer import TrainConfig
 
 SMALL = (
     *("--envs", "8", "--horizon", "4", "--samples", "64", "--backend", "cpu"),
@@ -67,8 +70,8 @@ def digest(folder: Path) -> str:
 @pytest.mark.parametrize(
     ("typed", "says"),
     [
-        ((), "Expected one of {train, evaluate, render, plot, clips}"),
-        (("trian",), "trian; Available subcommands: train, evaluate, render, plot, clips"),
+        ((), "Expected one of {train, evaluate, render, plot, bounds, clips}"),
+        (("trian",), "trian; Available subcommands: train, evaluate, render, plot, bounds, clips"),
         (("clips", "sohw"), "sohw; Available subcommands: list, check, show"),
         (("evaluate",), "Missing from jaxskills evaluate: RUN"),
         (("evaluate", "run", "--secnods", "3"), "Perhaps you meant: --seconds"),
@@ -85,6 +88,12 @@ def digest(folder: Path) -> str:
         (("evaluate", "run"), "'run' is not a run"),
         (("render", "run", "--out", "film.mp4"), "'run' is not a run"),
         (("render", "run", "--out", "film.avi"), "'film.avi': choose one of .mp4, .gif, .png"),
+        (
+            ("train", "walk", "--out", "run", "--bounds.file", "b.toml"),
+            "file 'b.toml' does not exi",
+        ),
+        (("bounds", "--out", "b.txt"), "unknown file format 'b.txt': choose one of .toml"),
+        (("bounds", "--out", "b.toml", "--character", "dog"), "unknown character 'dog'"),
         (("clips", "show", "walk", "--out", "film"), "'film': choose one of .mp4, .gif, .png"),
         (("clips", "check", "none.txt"), "clip 'none.txt' does not exist"),
         (("clips", "check", "walk", "--character", "dog"), "unknown character 'dog'"),
@@ -256,6 +265,49 @@ def test_ctrl_c_saves_and_resume_goes_on(
     assert checkpoint.read_config(run).envs == 8
 
 
+def test_bounds_of_a_file(
+    walker: list[str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+):
+    """The run holds the sizes themselves; options win over the file, which is not overwritten."""
+
+    def begin(config: TrainConfig, run: Path, *_: Any) -> tuple[None, None, dict[str, Any]]:
+        trainer.make(config)
+        run.mkdir(exist_ok=True)
+        checkpoint.write_config(run, config)
+        return None, None, {"why": "interrupted", "samples": 0}
+
+    monkeypatch.setattr(commands.train_lib, "train", begin)
+    file, run = tmp_path / "my.toml", tmp_path / "run"
+    assert main(["bounds", "--character", walker[3], "--out", str(file)]) == 0
+    assert "exists" in refused(capsys, "bounds", "--character", walker[3], "--out", file)
+    text = (
+        file.read_text().replace("joints = 0.7", "joints = 0.6").replace("root = 0.7", "root = 9")
+    )
+    file.write_text(text + "com_z = [[0.0, 0.2], [0.35, 0.5], [1.0, 0.2]]\n")
+    learn = [*walker, "--out", str(run)]
+    assert main([*learn, "--bounds.file", str(file), "--bounds.root", "0.5"]) == 130
+    knots = ((0.0, 0.2), (0.35, 0.5), (1.0, 0.2))
+    expected = BoundsConfig(joints=0.6, root=0.5, channels={"com_z": knots})
+    assert checkpoint.read_config(run).bounds == expected
+    assert str(file) not in (run / "config.json").read_text()
+    # Resumed: without the file as it was, with another file as that says.
+    file.write_text("joints = 0.4\n")
+    assert main([*learn, "--resume"]) == 130
+    assert checkpoint.read_config(run).bounds == expected
+    assert main([*learn, "--resume", "--bounds.file", str(file)]) == 130
+    assert checkpoint.read_config(run).bounds == BoundsConfig(joints=0.4)
+
+
+def test_a_bounds_file_with_a_channel_that_is_not_there(
+    walker: list[str], tmp_path: Path, capsys: Capture
+):
+    file = tmp_path / "my.toml"
+    file.write_text("[channels]\nleft_hipp = 0.3\n")
+    line = refused(capsys, *walker, "--out", tmp_path / "run", "--bounds.file", file)
+    assert line.startswith(f"bounds file '{file}': unknown bound 'left_hipp': choose one of com_x")
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("damage", ["cut", "gone", "config"])
 def test_damaged_run(damage: str, finished: Path, tmp_path: Path, capsys: Capture):
     run = tmp_path / "run"
@@ -298,7 +350,9 @@ def test_help_needs_no_jax():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert all(name in done.stdout for name in ("train", "evaluate", "render", "plot", "clips"))
+    assert all(
+        name in done.stdout for name in ("train", "evaluate", "render", "plot", "bounds", "clips")
+    )
 
 
 def test_as_a_module():

@@ -28,6 +28,8 @@ class Train:
     """Folder of the run. It must be new or empty, unless --resume is given."""
     resume: Flag = False
     """Go on with the run in that folder, with its settings except those given here."""
+    bounds_file: Annotated[Path | None, conf.arg(name="bounds.file", metavar="TOML")] = None
+    """File with the sizes of the bounds, see `jaxskills bounds`. Options --bounds... go first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +74,16 @@ class Plot:
     """Folder of a run."""
     out: Path
     """Picture to write: .png, .pdf or .svg."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """Write a file with the default bounds of a character, to edit and to train with."""
+
+    out: Path
+    """File to write: .toml. It must not exist yet."""
+    character: str = "humanoid34"
+    """A shipped character's name or an MJCF file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,5 +138,6 @@ Command = (
     | Annotated[Evaluate, conf.subcommand("evaluate")]
     | Annotated[Render, conf.subcommand("render")]
     | Annotated[Plot, conf.subcommand("plot")]
+    | Annotated[Bounds, conf.subcommand("bounds")]
     | Annotated[Clips, conf.subcommand("clips")]
 )

@@ -145,9 +145,14 @@ def _build(kind: Any, value: Any) -> Any:
         return kind(**{name: _build(hints[name], item) for name, item in value.items()})
     if origin in (typing.Union, types.UnionType):
         plain = [option for option in arguments if typing.get_origin(option) is not tuple]
-        return tuple(value) if isinstance(value, list) else (value if plain else None)
+        return _frozen(value) if isinstance(value, list) else (value if plain else None)
     if origin is tuple:
         return tuple(value)
     if origin is Mapping:
         return {name: _build(arguments[1], item) for name, item in value.items()}
     return value
+
+
+def _frozen(value: Any) -> Any:
+    """Returns lists, and lists in lists, as tuples."""
+    return tuple(_frozen(item) for item in value) if isinstance(value, list) else value

@@ -30,6 +30,8 @@ from jaxskills import evaluate as evaluate_lib
 from jaxskills import retarget as retarget_lib
 from jaxskills import train as train_lib
 from jaxskills import trainer as trainer_lib
+from jaxskills.env import bounds_file
+from jaxskills.env.bounds import BoundsConfig
 from jaxskills.errors import UserError, unknown
 from jaxskills.recipes import Recipe
 from jaxskills.trainer import TrainConfig, Trainer, TrainState
@@ -60,6 +62,8 @@ def perform(command: Any, settings: Any) -> Answer:
             return film(command)
         case arguments.Plot():
             return picture(command)
+        case arguments.Bounds():
+            return bounds(command)
         case arguments.ClipsList():
             return clips_list()
         case arguments.ClipsCheck():
@@ -87,16 +91,22 @@ def settings_of(command: arguments.Train, config: TrainConfig) -> TrainConfig:
       config: the recipe's settings with the options.
 
     Raises:
-      UserError: there is no such run, or it learns another clip.
+      UserError: there is no such run, it learns another clip, or the bounds file is bad.
     """
     if not command.resume:
-        return settings(recipes.find(command.skill))
-    saved = checkpoint.read_config(command.out)
-    if saved.clip != _absolute(config.clip):
-        raise UserError(
-            f"run '{command.out}' learns '{saved.clip}', not '{config.clip}': give another --out"
-        )
-    return saved
+        found, character = settings(recipes.find(command.skill)), config.character
+    else:
+        found = checkpoint.read_config(command.out)
+        character = found.character
+        if found.clip != _absolute(config.clip):
+            raise UserError(
+                f"run '{command.out}' learns '{found.clip}', not '{config.clip}':"
+                " give another --out"
+            )
+    if command.bounds_file is None:
+        return found
+    sizes = bounds_file.read(command.bounds_file, character_lib.load(character))
+    return dataclasses.replace(found, bounds=sizes)
 
 
 def train(command: arguments.Train, config: TrainConfig) -> Answer:
@@ -156,6 +166,14 @@ def picture(command: arguments.Plot) -> Answer:
     title = f"{Path(made.config.clip).stem} on {made.character.name}"
     path = plot.figure(command.out, title, metrics, playback.played(made, trace))
     return Answer(f"wrote {path}", {"out": str(path)})
+
+
+def bounds(command: arguments.Bounds) -> Answer:
+    """Writes the default bounds of a character."""
+    _admit(command.out, bounds_file.SUFFIXES)
+    character = character_lib.load(command.character)
+    bounds_file.write(command.out, character, BoundsConfig())
+    return Answer(f"wrote {command.out}", {"out": str(command.out)})
 
 
 def _open(run: Path, backend: str) -> tuple[Trainer, TrainState]:

@@ -18,16 +18,20 @@ from jaxskills.character import Character
 from jaxskills.errors import UserError, unknown
 from jaxskills.kinematics import Bodies
 
-Size = float | tuple[float, ...]
+# A number, numbers evenly spread over a cycle, or knots (share of the cycle, size) in any places.
+Size = float | tuple[float, ...] | tuple[tuple[float, float], ...]
 
 _COM = ("com_x", "com_y", "com_z")
+_FINEST = 200  # steps of a cycle that knots are resampled to, unless fewer meet them all
+OPEN = 1e6  # m or rad, instead of infinity, to which no line leads
 
 
 @dataclasses.dataclass(frozen=True)
 class BoundsConfig:
-    """Sizes of the bounds, scalars or one value per knot of phase (evenly spread over a cycle).
+    """Sizes of the bounds; infinity switches one off.
 
-    Defaults are the authors' own (SB section 5.1 prints 0.2 m for the horizontal ones too).
+    Defaults are the authors' own (SB section 5.1 prints 0.2 m for the horizontal ones too). A size
+    over the cycle is linear between its knots and held before the first and after the last.
     """
 
     com: tuple[float, float, float] = (0.3, 0.3, 0.2)  # m: x, y, up
@@ -55,30 +59,56 @@ def channel_names(character: Character) -> tuple[str, ...]:
     return (*_COM, "root", *joints, *(f"{name}_position" for name in character.end_effectors))
 
 
+def channel_units(character: Character) -> tuple[str, ...]:
+    """Returns the K units of a character's channels, `m` or `rad`."""
+    joints, effectors = len(character.layout.joints) - 1, len(character.end_effectors)
+    return (*("m",) * len(_COM), "rad", *("rad",) * joints, *("m",) * effectors)
+
+
+def default_sizes(character: Character, config: BoundsConfig) -> tuple[float, ...]:
+    """Returns the K sizes that hold where `config.channels` names no other."""
+    joints, effectors = len(character.layout.joints) - 1, len(character.end_effectors)
+    return (
+        *config.com,
+        config.root,
+        *(config.joints,) * joints,
+        *(config.end_effectors,) * effectors,
+    )
+
+
 def make(character: Character, config: BoundsConfig) -> Bounds:
     """Returns the bounds of a configuration.
 
     Raises:
-      UserError: an unknown channel or body, or a size that is not a positive number.
+      UserError: see `table`.
+    """
+    sizes = jnp.asarray(table(character, config), jnp.float32)
+    forbidden = tuple(character.body(name) for name in config.no_ground_contact)
+    return Bounds(sizes, channel_names(character), forbidden)
+
+
+def table(character: Character, config: BoundsConfig) -> np.ndarray:
+    """Returns the sizes `[P, K]` at even steps of the cycle, one row if none changes over it.
+
+    The steps are the fewest that meet all knots, if 200 do; with 200 a corner between two steps is
+    cut by at most half a percent of the cycle.
+
+    Raises:
+      UserError: an unknown channel or body, a size that is not a positive number, knots that are
+        out of order or of the cycle.
     """
     names = channel_names(character)
-    joints, effectors = len(character.layout.joints) - 1, len(character.end_effectors)
-    default = (*config.com, config.root, *(config.joints,) * joints)
-    by_name: dict[str, Size] = dict(
-        zip(names, (*default, *(config.end_effectors,) * effectors), strict=True)
-    )
+    by_name: dict[str, Size] = dict(zip(names, default_sizes(character, config), strict=True))
     for name, size in config.channels.items():
         if name not in by_name:
             raise unknown("bound", name, names)
         by_name[name] = size
-    tables = {name: np.atleast_1d(np.asarray(size, float)) for name, size in by_name.items()}
-    for name, table in tables.items():
-        if table.ndim != 1 or not table.size or not (table > 0).all():
-            raise UserError(f"bound {name} is {by_name[name]}: give positive sizes (m or rad)")
-    knots = max(len(table) for table in tables.values())
-    columns = [_spread(table, knots) for table in tables.values()]
-    forbidden = tuple(character.body(name) for name in config.no_ground_contact)
-    return Bounds(jnp.asarray(np.stack(columns, 1), jnp.float32), names, forbidden)
+    for name in config.no_ground_contact:
+        character.body(name)
+    knots = [_knots(name, size) for name, size in by_name.items()]
+    grid = np.linspace(0.0, 1.0, _steps([shares for shares, _ in knots]) + 1)
+    columns = [np.interp(grid, shares, np.minimum(values, OPEN)) for shares, values in knots]
+    return np.stack(columns, axis=1)
 
 
 def sizes(bounds: Bounds, share: jax.Array) -> jax.Array:
@@ -121,8 +151,35 @@ def heading_effectors(bodies: Bodies, indices: tuple[int, ...], axis: jax.Array)
     return rotation.turn_back(frame, bodies.pos[np.array(indices, int)] - origin)
 
 
-def _spread(table: np.ndarray, knots: int) -> np.ndarray:
-    """Returns the table at `knots` even places."""
-    if len(table) == 1:
-        return np.full(knots, table[0])
-    return np.interp(np.linspace(0, 1, knots), np.linspace(0, 1, len(table)), table)
+def _knots(name: str, size: Size) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the shares of the cycle and the sizes there, both `[k]`."""
+    try:
+        values: np.ndarray = np.atleast_1d(np.asarray(size, float))
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    shares: np.ndarray = np.linspace(0.0, 1.0, len(values))
+    if values.ndim == 2 and values.shape[-1] == 2:
+        shares, values = values[:, 0], values[:, 1]
+    if values.ndim != 1 or not values.size or not (values > 0).all():
+        raise UserError(
+            f"bound {name} is {size}: give positive sizes (m or rad), or knots [share, size]"
+        )
+    if not ((shares >= 0) & (shares <= 1)).all() or not (np.diff(shares) > 0).all():
+        raise UserError(
+            f"bound {name} has knots at {', '.join(f'{share:g}' for share in shares)}: give"
+            " shares of the cycle that rise from 0 to 1"
+        )
+    return shares, values
+
+
+def _steps(shares: list[np.ndarray]) -> int:
+    """Returns the fewest even steps of the cycle that meet all shares, or the most allowed."""
+    several = [one for one in shares if len(one) > 1]
+    if not several:
+        return 0
+    places = np.unique(np.concatenate(several))
+    most = max(_FINEST, *(len(one) - 1 for one in several))
+    for steps in range(1, most):
+        if np.abs(places * steps - np.round(places * steps)).max() < 1e-6:
+            return steps
+    return most
