@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A controller played back: what pictures and films are made of."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -11,6 +12,7 @@ from PIL import Image
 
 from jaxskills import playback, plot, trainer
 from jaxskills.compilation import jit
+from jaxskills.env.bounds import BoundsConfig
 from jaxskills.errors import UserError
 from jaxskills.evaluate import EvaluateConfig, Trace
 from jaxskills.render import opengl
@@ -72,6 +74,20 @@ def test_height_of_the_reference(untrained: tuple[Trainer, TrainState], trace: T
     # masses and heights: pelvis 3 kg, torso 2 kg, legs 1 kg each, feet 0.5 kg each
     standing = (3 * 0.5 + 2 * (0.58 + 0.125) + 2 * (0.5 - 0.24) + 1 * (0.5 - 0.48)) / 8
     np.testing.assert_allclose(shown.reference_height, standing, atol=0.02)
+
+
+def test_the_bound_on_the_height_over_phase(untrained: tuple[Trainer, TrainState], trace: Trace):
+    made = untrained[0]
+    for size, expected in (
+        (
+            ((0.0, 0.2), (0.35, 0.5), (1.0, 0.2)),
+            np.interp(np.linspace(0, 1, 101), [0, 0.35, 1], [0.2, 0.5, 0.2]),
+        ),
+        (float("inf"), np.full(101, np.nan)),
+    ):
+        changed = dataclasses.replace(made.config, bounds=BoundsConfig(channels={"com_z": size}))
+        shown = playback.played(made._replace(config=changed), trace)
+        np.testing.assert_allclose(shown.bound, expected)
 
 
 def test_picture(untrained: tuple[Trainer, TrainState], trace: Trace, tmp_path: Path):

@@ -11,6 +11,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 
 from jaxskills import plot
@@ -88,6 +89,15 @@ def _hue(colour) -> str:
     return ("red", "green", "blue")[int(np.argmax(matplotlib.colors.to_rgb(colour)))]
 
 
+def test_com_height_within_bounds_over_phase(axes):
+    grid = np.array([0.0, 0.5, 1.0])
+    bound = np.array([0.1, 0.3, np.nan])  # open at the end
+    plot.com_height(grid, 0 * grid, grid, 0 * grid, bound, axes)
+    red = [np.asarray(line.get_ydata()) for line in axes.lines if _hue(line.get_color()) == "red"]
+    np.testing.assert_array_equal(red, [-bound, bound])
+    assert np.isfinite(axes.get_ylim()).all()
+
+
 def test_com_height_thins_out_very_many_dots(axes):
     many = np.linspace(0, 1, 100_001)
     plot.com_height(many, many, many[:2], many[:2], 0.2, axes)
@@ -111,6 +121,41 @@ def test_margins_show_mean_and_worst_of_the_tightest(axes):
     assert any(np.array_equal(line.get_ydata(), [0, 0]) for line in axes.lines)  # the bound
 
 
+def test_regions_show_least_mean_and_largest_of_every_bound():
+    phase = np.array([0.001, 0.002, 0.999])
+    by_bound = {f"b{i}": np.array([0.4, 0.2, 0.1 * i]) for i in range(6)}
+    by_bound["left"] = np.array([0.9, 0.5, -0.25])
+    page = Figure()
+    plot.regions(phase, by_bound, page)
+    shown = [axes for axes in page.axes if axes.get_visible()]
+    titles = [axes.get_title(loc="left") for axes in shown]
+    assert titles[0] == "b0  0.00" and titles[2:] == [
+        *(f"b{i}  0.20" for i in range(2, 6)),
+        "left  -0.25",
+    ]
+    band, mean = shown[-1].collections[0].get_paths()[0].vertices, shown[-1].lines[0]
+    assert {0.9, 0.5, -0.25} == set(np.asarray(band)[:, 1])
+    np.testing.assert_allclose(np.asarray(mean.get_ydata()), [0.7, -0.25])
+    np.testing.assert_allclose(np.asarray(mean.get_xdata()), [0.0125, 0.9875])
+    colours = {text.get_text(): text.get_color() for text in page.findobj(Text)}
+    assert [title for title in titles if colours[title] != "black"] == ["left  -0.25"]
+
+
+def test_training_endings_are_summed_over_the_lines(axes):
+    rows = [dict(line) for line in METRICS]
+    rows[0]["endings"] = {"com_z": [1, 0, 2], "root": [0, 0, 1]}
+    rows[2]["endings"] = {"com_z": [1, 0, 0], "time limit": [7, 7, 7]}
+    plot.training_endings(rows, axes)
+    assert np.array_equal(np.asarray(axes.images[0].get_array()), [[2, 0, 2], [0, 0, 1]])
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["com_z (4)", "root (1)"]
+    assert axes.get_title(loc="left") == "Where 5 training episodes ended"
+
+
+def test_training_endings_of_a_run_that_did_not_record_them(axes):
+    plot.training_endings(METRICS, axes)
+    assert [text.get_text() for text in axes.texts] == ["not recorded"]
+
+
 def test_endings_map(axes):
     counts = {"com_z": np.array([0, 2, 1]), "root": np.array([5, 0, 0]), "neck": np.zeros(3)}
     plot.endings(counts, axes)
@@ -130,7 +175,7 @@ PLAYED = plot.Played(
     height=np.full(50, 0.9),
     reference_phase=np.array([0.0, 1.0]),
     reference_height=np.array([0.9, 0.9]),
-    bound=0.2,
+    bound=np.array([0.2, 0.2]),
     margins={"com_z": np.linspace(0, 1, 50), "root": np.full(50, 0.5)},
     endings={"com_z": np.array([1, 2]), "root": np.array([0, 1])},
 )

@@ -81,6 +81,10 @@ def test_a_run_writes_its_settings_lines_events_and_state(config: TrainConfig, t
         shares = [value for name, value in line.items() if name.startswith("ended/")]
         assert bool(shares) == ("worst_bound" in line)  # in one update nothing need have ended
         assert not shares or sum(shares) == pytest.approx(1.0, abs=1e-3)
+        counts = {name: sum(row) for name, row in line.get("endings", {}).items()}
+        assert {len(row) for row in line.get("endings", {}).values()} <= {trainer.PHASE_BINS}
+        for name, count in counts.items():
+            assert line[f"ended/{name}"] == pytest.approx(count / sum(counts.values()), abs=1e-4)
     assert "worst_bound" in lines[1]
     walls = [line["wall_s"] for line in lines]
     assert walls == sorted(walls)

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxskills import evaluate, motion, plot, render
 from jaxskills.compilation import jit
+from jaxskills.env import bounds
 from jaxskills.evaluate import EvaluateConfig, Trace
 from jaxskills.motion import CONTROL_DT
 from jaxskills.trainer import PHASE_BINS, Trainer, TrainState
@@ -54,12 +55,14 @@ def played(made: Trainer, trace: Trace) -> plot.Played:
     phase = phase % 1.0 if made.motion.loop else np.minimum(phase, 1.0)
     grid = np.linspace(0.0, 1.0, 101)
     up = names.index("com_z")
+    bound = bounds.table(made.character, made.config.bounds)[:, up]
+    bound = np.where(bound < bounds.OPEN, bound, np.nan)
     return plot.Played(
         phase=phase[standing],
         height=np.asarray(trace.com)[..., 2][standing],
         reference_phase=grid,
         reference_height=_com_height(made.character.model, _reference(made, grid * length)),
-        bound=float(sizes[..., up].min()),
+        bound=np.interp(grid, np.linspace(0.0, 1.0, len(bound)), bound),
         margins={name: margins[:, i] for i, name in enumerate(names)},
         endings=_endings(names, errors / sizes, inside, phase),
     )

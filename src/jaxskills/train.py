@@ -180,7 +180,9 @@ def line(
     count = len(metrics)
     endings = np.asarray(total["endings"])
     ended: dict[str, Any] = {}
+    by_cause = zip(made.env.endings, endings.astype(int).tolist(), strict=True)
     if endings.any():
+        ended["endings"] = {name: counts for name, counts in by_cause if any(counts)}
         cause, place = np.unravel_index(endings.argmax(), endings.shape)
         ended["worst_bound"] = made.env.endings[cause]
         ended["worst_phase"] = round((float(place) + 0.5) / endings.shape[1], 3)

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a training went, from the lines of metrics.jsonl: how long episodes last, what ends them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from jaxskills.errors import UserError
+from jaxskills.plot import states
+from jaxskills.plot.sheet import (
+    BLUE,
+    CYCLE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PHASE,
+    finish,
+    foremost,
+    legend_beside,
+    say,
+)
+
+_REQUIRED = ("samples", "wall_s", "survival_s")
+
+
+def learning_curve(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
+    """Draws the mean length of episodes, and of evaluated ones, over training samples.
+
+    Raises:
+      UserError: no lines, or a line without `samples`, `wall_s` or `survival_s`.
+    """
+    _check(metrics)
+    samples = _millions(metrics)
+    survival = _column(metrics, "survival_s")
+    mark = "" if len(survival) > 1 else "o"
+    axes.plot(samples, survival, color=BLUE, marker=mark, label="training, until a bound")
+    for key, colour, label in (
+        ("inside_seconds_mean", GREEN, "test, until a bound"),
+        ("seconds_mean", ORANGE, "test, until a fall"),
+    ):
+        values = _column(metrics, key)
+        seen = np.isfinite(values)
+        if seen.any():
+            axes.plot(samples[seen], values[seen], "o-", color=colour, ms=3, lw=1, label=label)
+    axes.set_xlim(left=0.0)
+    axes.set_ylim(bottom=0.0)
+    last = metrics[-1]
+    told = f"Learning curve: {last['samples'] / 1e6:.3g} million samples, {_duration(last)}"
+    finish(axes, told, "samples (millions)", "mean length of an episode (s)")
+    axes.legend(fontsize=8, frameon=False)
+
+
+def causes(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
+    """Draws which share of training episodes each bound ended, from the `ended/<bound>` entries.
+
+    Raises:
+      UserError: see `learning_curve`.
+    """
+    _check(metrics)
+    names = sorted({key for line in metrics for key in line if key.startswith("ended/")})
+    all_causes = {n.removeprefix("ended/"): np.nan_to_num(_column(metrics, n)) for n in names}
+    shown = foremost(all_causes, len(CYCLE))
+    finish(axes, "What ended training episodes", "samples (millions)", "share (%)")
+    axes.set_ylim(0, 100)
+    if not shown:
+        say(axes, "no episode has ended yet")
+        return
+    until = np.append(0.0, _millions(metrics))  # a line counts what happened since the one before
+    shares = [100.0 * np.append(share[:1], share) for share in shown.values()]
+    colours = (*CYCLE, GREY)
+    axes.stackplot(until, shares, labels=list(shown), colors=colours, alpha=0.85)
+    axes.margins(x=0)
+    legend_beside(axes, reverse=True)  # in the order of the stack
+
+
+def training_endings(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
+    """Draws where in the cycle training episodes ended, all lines together, and by which bound.
+
+    Episodes that lasted to their time limit are not counted.
+
+    Raises:
+      UserError: see `learning_curve`.
+    """
+    _check(metrics)
+    recorded = [line["endings"] for line in metrics if "endings" in line]
+    if not recorded:
+        finish(axes, "Where training episodes ended", PHASE, "")
+        axes.set_yticks([])
+        say(axes, "not recorded")
+        return
+    total: dict[str, np.ndarray] = {}
+    for name in {name: None for line in recorded for name in line if name != "time limit"}:
+        total[name] = np.sum([line[name] for line in recorded if name in line], axis=0)
+    states.endings(total, axes, told="Where {} training episodes ended")
+
+
+def _check(metrics: Sequence[Mapping[str, Any]]) -> None:
+    if not metrics:
+        raise UserError("there is nothing to plot: metrics.jsonl has no lines yet")
+    for number, line in enumerate(metrics, 1):
+        missing = [key for key in _REQUIRED if key not in line]
+        if missing:
+            raise UserError(f"line {number} of metrics.jsonl lacks {', '.join(missing)}")
+
+
+def _column(metrics: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
+    """Returns an entry of every line, NaN where a line lacks it."""
+    return np.array([line.get(key, np.nan) for line in metrics], float)
+
+
+def _millions(metrics: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    return _column(metrics, "samples") / 1e6
+
+
+def _duration(line: Mapping[str, Any]) -> str:
+    seconds = float(line["wall_s"])
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
