@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from jaxskills import paths
@@ -99,7 +100,7 @@ def _read(path: Path, target: TrainState) -> TrainState:
     for name in sorted(saved.keys() ^ asked.keys()):
         raise ValueError(f"{name} is {'not wanted' if name in saved else 'missing'}")
     for name, leaf in asked.items():
-        is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         if leaf.shape != saved[name] and not is_key:
             raise ValueError(f"{name} has shape {saved[name]} instead of {leaf.shape}")
     how = ocp.args.PyTreeRestore(
