@@ -30,7 +30,7 @@ explore.starts explore.evolution explore
 
 trainer checkpoint evaluate train
 render.opengl render.stage render.take render.video render.strip render
-plot.sheet plot.states plot.training plot playback provenance
+plot.sheet plot.states plot.training plot.starts plot playback provenance
 
 recipes progress arguments commands cli __main__
 """.split()

@@ -15,6 +15,8 @@ from jaxskills.compilation import jit
 from jaxskills.env.bounds import BoundsConfig
 from jaxskills.errors import UserError
 from jaxskills.evaluate import EvaluateConfig, Trace
+from jaxskills.explore import evolution
+from jaxskills.explore.evolution import EvolutionConfig
 from jaxskills.render import opengl
 from jaxskills.trainer import Trainer, TrainState
 
@@ -74,6 +76,25 @@ def test_height_of_the_reference(untrained: tuple[Trainer, TrainState], trace: T
     # masses and heights: pelvis 3 kg, torso 2 kg, legs 1 kg each, feet 0.5 kg each
     standing = (3 * 0.5 + 2 * (0.58 + 0.125) + 2 * (0.5 - 0.24) + 1 * (0.5 - 0.48)) / 8
     np.testing.assert_allclose(shown.reference_height, standing, atol=0.02)
+
+
+def test_evolved_starts(untrained: tuple[Trainer, TrainState]):
+    """A tenth of a metre higher than the reference, everywhere: so much are all bodies apart."""
+    made, state = untrained
+    assert playback.evolved(made, state) is None
+    elites = evolution.init(
+        EvolutionConfig(elites=3), made.character.layout, made.motion, segments=5
+    )
+    higher = elites.qpos + 0.1 * (np.arange(elites.qpos.shape[-1]) == 2)
+    shown = playback.evolved(made, state.replace(elites=elites.replace(qpos=higher)))
+    assert shown is not None
+    np.testing.assert_allclose(shown.phase, np.arange(15) / 15, atol=1e-6)
+    assert shown.places.shape == shown.at_phase.shape == (15, 12)
+    apart = (shown.places - shown.at_phase).reshape(15, 4, 3)
+    np.testing.assert_allclose(apart, np.broadcast_to([0.0, 0.0, 0.1], (15, 4, 3)), atol=1e-5)
+    # The walk goes half a metre ahead, but is seen from under the root.
+    assert np.abs(shown.reference[:, 0]).max() < 0.01
+    assert shown.reference.shape == (201, 12) and shown.reference_phase[-1] == 1.0
 
 
 def test_the_bound_on_the_height_over_phase(untrained: tuple[Trainer, TrainState], trace: Trace):

@@ -16,6 +16,7 @@ from PIL import Image
 
 from jaxskills import plot
 from jaxskills.errors import UserError
+from jaxskills.plot import starts
 
 METRICS = [
     {"samples": 1e6, "wall_s": 60.0, "survival_s": 0.5, "ended/com_z": 0.75, "ended/root": 0.25},
@@ -179,6 +180,42 @@ PLAYED = plot.Played(
     margins={"com_z": np.linspace(0, 1, 50), "root": np.full(50, 0.5)},
     endings={"com_z": np.array([1, 2]), "root": np.array([0, 1])},
 )
+
+
+# Two bodies; the starts are off the reference by (0.03, 0.04, 0) m and by nothing, then by nothing.
+EVOLVED = plot.Evolved(
+    phase=np.array([0.25, 0.75]),
+    places=np.array([[1.03, 0.04, 0, 2, 0, 0], [3, 0, 0, 4, 0, 0.0]]),
+    at_phase=np.array([[1.0, 0, 0, 2, 0, 0], [3, 0, 0, 4, 0, 0]]),
+    reference_phase=np.array([0.0, 0.5, 1.0]),
+    reference=np.array([[0.0, 0, 0, 1, 0, 0], [2, 0, 0, 3, 0, 0], [4, 0, 0, 5, 0, 0]]),
+)
+
+
+def test_distance_of_evolved_starts(axes):
+    starts.distance(EVOLVED, axes)
+    dots = np.asarray(axes.collections[0].get_offsets())
+    np.testing.assert_allclose(dots, [[0.25, 5.0 / np.sqrt(2.0)], [0.75, 0.0]], atol=1e-12)
+    assert axes.get_title(loc="left").startswith("Evolved starts are 1.8 cm from")
+
+
+def test_first_component_of_evolved_starts_is_fig_13(axes):
+    """All lies along (1, 0, 0, 1, 0, 0), so a step of 1 m of both bodies is one of sqrt 2."""
+    evolved = dataclasses.replace(EVOLVED, places=EVOLVED.at_phase)
+    starts.component(evolved, axes)
+    blue, green = (np.asarray(dots.get_offsets()) for dots in axes.collections)
+    np.testing.assert_allclose(blue[:, 0], [0.25, 0.75])
+    np.testing.assert_allclose(blue[:, 1], np.sqrt(2.0) * np.array([-1.0, 1.0]), atol=1e-12)
+    np.testing.assert_allclose(green[:, 1], np.sqrt(2.0) * np.array([-2.0, 0, 2]), atol=1e-12)
+    assert [_hue(c.get_facecolor()[0]) for c in axes.collections] == ["blue", "green"]
+    assert "(100% of what varies)" in axes.get_title(loc="left")
+
+
+def test_page_of_a_run_whose_starts_evolve(tmp_path):
+    path = plot.figure(tmp_path / "walk.png", "walk", METRICS, None, EVOLVED)
+    page = np.asarray(Image.open(path).convert("L"), float)
+    assert page.shape[0] > 1000
+    assert all((half < 128).mean() > 0.005 for half in np.array_split(page, 2))
 
 
 def test_page(tmp_path):

@@ -164,7 +164,9 @@ def picture(command: arguments.Plot) -> Answer:
     metrics = _metrics(command.run / "metrics.jsonl")
     trace = playback.play(made, state, evaluate_lib.EvaluateConfig())
     title = f"{Path(made.config.clip).stem} on {made.character.name}"
-    path = plot.figure(command.out, title, metrics, playback.played(made, trace))
+    path = plot.figure(
+        command.out, title, metrics, playback.played(made, trace), playback.evolved(made, state)
+    )
     return Answer(f"wrote {path}", {"out": str(path)})
 
 

@@ -15,6 +15,7 @@ from jaxskills.motion import CONTROL_DT
 from jaxskills.trainer import PHASE_BINS, Trainer, TrainState
 
 _AFTER_FALL = 1.0  # s of film after the character has fallen, or the motion is over
+_STARTS = 4000  # evolved starts that are drawn at most
 
 
 def play(made: Trainer, state: TrainState, config: EvaluateConfig) -> Trace:
@@ -66,6 +67,37 @@ def played(made: Trainer, trace: Trace) -> plot.Played:
         margins={name: margins[:, i] for i, name in enumerate(names)},
         endings=_endings(names, errors / sizes, inside, phase),
     )
+
+
+def evolved(made: Trainer, state: TrainState) -> plot.Evolved | None:
+    """Returns the evolved starts of a run, as `plot.figure` wants them; None if they do not evolve.
+
+    Compared are the centres of mass of the bodies, seen from the ground under the root: the root's
+    place on the ground is the reference's in every elite.
+    """
+    if state.elites is None:
+        return None
+    qpos, phase = np.asarray(state.elites.qpos), np.asarray(state.elites.phase).ravel()
+    few = slice(None, None, len(phase) // _STARTS + 1)
+    qpos, phase = qpos.reshape(len(phase), -1)[few], phase[few]
+    model, grid = made.character.model, np.linspace(0.0, 1.0, 201)
+    return plot.Evolved(
+        phase=phase / made.env.length,
+        places=_places(model, qpos),
+        at_phase=_places(model, _reference(made, phase)),
+        reference_phase=grid,
+        reference=_places(model, _reference(made, grid * made.env.length)),
+    )
+
+
+def _places(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Returns the bodies' centres of mass `[N, 3 bodies]` in m, seen from under the root."""
+    data, places = mujoco.MjData(model), []
+    for pose in qpos:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        places.append(data.xipos[1:] - [*pose[:2], 0.0])
+    return np.reshape(places, (len(qpos), -1))
 
 
 def _endings(

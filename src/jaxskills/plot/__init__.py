@@ -14,10 +14,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxskills.errors import unknown
+from jaxskills.plot import starts
+from jaxskills.plot.starts import Evolved
 from jaxskills.plot.states import com_height, endings, margins, regions, regions_height
 from jaxskills.plot.training import causes, learning_curve, training_endings
 
 __all__ = [
+    "Evolved",
     "FORMATS",
     "Played",
     "causes",
@@ -50,7 +53,11 @@ class Played:
 
 
 def figure(
-    path: str | Path, title: str, metrics: Sequence[Mapping[str, Any]], played: Played | None
+    path: str | Path,
+    title: str,
+    metrics: Sequence[Mapping[str, Any]],
+    played: Played | None,
+    evolved: Evolved | None = None,
 ) -> Path:
     """Writes the page with all the pictures and returns its path.
 
@@ -59,6 +66,7 @@ def figure(
       title: what was learnt.
       metrics: lines of metrics.jsonl.
       played: states of the trained controller; None leaves their pictures out.
+      evolved: starts of a run whose starts evolve.
 
     Raises:
       UserError: another suffix, or metrics without lines or without what each line must have.
@@ -69,6 +77,8 @@ def figure(
     heights = [_ROW]
     if played is not None:
         heights += [_ROW, _ROW, regions_height(len(played.margins))]
+    if evolved is not None:
+        heights += [_ROW]
     page = Figure(figsize=(11.0, _TITLE + sum(heights)), dpi=150, layout="constrained")
     page.suptitle(title, fontsize=14, fontweight="bold")
     # Rows of their own, so that long names in one do not narrow the others.
@@ -91,6 +101,10 @@ def figure(
         training_endings(metrics, left)
         endings(played.endings, right)
         regions(played.phase, played.margins, rows[3])
+    if evolved is not None:
+        left, right = rows[-1].subplots(1, 2)
+        starts.component(evolved, left)
+        starts.distance(evolved, right)
     path.parent.mkdir(parents=True, exist_ok=True)
     page.savefig(path)
     return path
