@@ -26,7 +26,7 @@ physics.quiet physics.ffi physics.base physics.cpu physics.box_floor physics.exp
 physics.mjx physics.servo physics
 env.observe env.bounds env.bounds_file env.rewards env.style env.core env
 learn.networks learn.normalize learn.gae learn.ppo learn.rollout learn
-explore.starts explore.evolution explore
+explore.starts explore.evolution explore.adaptive explore
 
 trainer checkpoint evaluate train
 render.opengl render.stage render.take render.video render.strip render

@@ -49,6 +49,16 @@ def test_learning_curve(axes):
     assert axes.get_ylim()[0] == 0 and "(s)" in axes.get_ylabel()
 
 
+def test_learning_curve_with_adaptive_bounds(axes):
+    rows = [
+        row | {"bound_scale": scale} for row, scale in zip(METRICS, (1.0, 1.2, 0.9), strict=True)
+    ]
+    plot.learning_curve(rows, axes)
+    _, right = axes.figure.axes
+    assert np.array_equal(right.lines[0].get_xydata(), [[1, 1.0], [2, 1.2], [4, 0.9]])
+    assert right.get_ylabel() == "scale of the bounds" and right.get_ylim()[0] == 0
+
+
 def test_causes_stack_to_the_whole(axes):
     plot.causes(METRICS, axes)
     assert _texts(axes) == ["root", "time limit", "com_z"]  # the largest at the bottom

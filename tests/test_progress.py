@@ -20,6 +20,12 @@ def test_line(samples: int, pace: float, text: str):
     assert progress.line("walk", 20_000_000, metrics, pace) == text
 
 
+def test_line_of_adaptive_bounds():
+    metrics = {"samples": 0, "survival_s": 3.14, "bound_scale": 0.851}
+    expected = "walk  0 of 20M samples (0%)  survival 3.1 s  bounds x0.85  0/s  ? left"
+    assert progress.line("walk", 20_000_000, metrics, 0.0) == expected
+
+
 def _report_five(every: float) -> None:
     with progress.live("walk", 10, every=every) as report:
         for samples in range(1, 6):

@@ -3,7 +3,8 @@
 
 As in SB Table 1, bounds do not end an evaluated episode: a fall does, that is any body on the floor
 that the character may not stand on. Actions are the policy's mean, starts are random phases. An
-episode of a motion that does not loop is over soon after its end, and cannot fall any more.
+episode of a motion that does not loop is over soon after its end, and cannot fall any more. Bounds
+have the sizes of the configuration, adaptive ones too, so that runs can be compared.
 """
 
 import dataclasses

@@ -199,6 +199,7 @@ def line(
         "value_loss": float(total["value_loss"] / count),
         "policy_lr": float(total["policy_lr"] / count),
         "diverged": int(total["diverged"]),
+        **({"bound_scale": float(metrics[-1]["bound_scale"])} if "bound_scale" in total else {}),
         **ended,
     }
 

@@ -23,6 +23,7 @@ from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import core
 from jaxskills.errors import UserError
+from jaxskills.explore import adaptive as adaptive_lib
 from jaxskills.explore import evolution as evolution_lib
 from jaxskills.explore import starts as starts_lib
 from jaxskills.learn import gae, normalize, rollout
@@ -47,6 +48,7 @@ class TrainConfig:
     horizon: int = 16  # control steps of each environment in an update
     env: core.EnvConfig = core.EnvConfig()
     bounds: bounds_lib.BoundsConfig = dataclasses.field(default_factory=bounds_lib.BoundsConfig)
+    adaptive_bounds: adaptive_lib.AdaptiveBoundsConfig = adaptive_lib.AdaptiveBoundsConfig()
     motion: motion_lib.MotionConfig = motion_lib.MotionConfig()
     starts: starts_lib.StartsConfig = starts_lib.StartsConfig()
     evolution: evolution_lib.EvolutionConfig = evolution_lib.EvolutionConfig()
@@ -66,6 +68,7 @@ class TrainState:
     key: jax.Array  # root of all randomness; the number of updates is folded in
     updates: jax.Array  # [] int32
     samples: jax.Array  # [] uint32, transitions learnt from
+    adaptive: adaptive_lib.Adaptive | None = None  # None: the bounds stay as they are
 
 
 class Trainer(NamedTuple):
@@ -132,11 +135,14 @@ def make(config: TrainConfig) -> Trainer:
         starts, elites = starts_lib.init(config.starts), None
         if config.evolution.enabled:
             elites = evolution_lib.init(config.evolution, layout, motion, config.starts.segments)
-        current = begin(starts, elites, start_key)
+        adaptive = None
+        if config.adaptive_bounds.enabled:
+            adaptive = adaptive_lib.init(config.adaptive_bounds)
+        current = adaptive_lib.under(adaptive, begin(starts, elites, start_key))
         normalizer = normalize.update(normalize.init(obs_size), current.obs)
         learner = ppo_lib.init(config.ppo, nets, learner_key)
         counts = jnp.int32(0), jnp.uint32(0)
-        return TrainState(learner, normalizer, starts, elites, current, key, *counts)
+        return TrainState(learner, normalizer, starts, elites, current, key, *counts, adaptive)
 
     def update(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(state.key, state.updates)
@@ -146,8 +152,8 @@ def make(config: TrainConfig) -> Trainer:
             nets,
             state.learner.policy,
             state.normalizer,
-            state.current,
-            begin(state.starts, state.elites, start_key),
+            adaptive_lib.under(state.adaptive, state.current),
+            adaptive_lib.under(state.adaptive, begin(state.starts, state.elites, start_key)),
             act_key,
             config.horizon,
         )
@@ -169,6 +175,12 @@ def make(config: TrainConfig) -> Trainer:
                 config.evolution, elites, visited, evolve_key, motion.length
             )
         metrics |= episode_metrics(env, steps)
+        adaptive = state.adaptive
+        if adaptive is not None:
+            metrics["bound_scale"] = adaptive.scale
+            failures = jnp.sum(steps.terminated, dtype=jnp.float32)
+            seconds = config.envs * config.horizon * CONTROL_DT
+            adaptive = adaptive_lib.update(config.adaptive_bounds, adaptive, failures, seconds)
         new_state = TrainState(
             learner,
             normalize.update(state.normalizer, flat_obs),
@@ -178,6 +190,7 @@ def make(config: TrainConfig) -> Trainer:
             state.key,
             state.updates + 1,
             state.samples + jnp.uint32(config.envs * config.horizon),
+            adaptive,
         )
         return new_state, metrics
 
@@ -266,4 +279,9 @@ def validate(config: TrainConfig) -> None:
     core.validate(config.env)
     starts_lib.validate(config.starts)
     evolution_lib.validate(config.evolution)
+    adaptive_lib.validate(config.adaptive_bounds)
+    if config.adaptive_bounds.enabled and config.env.stop != "bounds":
+        raise UserError(
+            f"env.stop is {config.env.stop}: adaptive_bounds need bounds, which end the episodes"
+        )
     ppo_lib.validate(config.ppo, config.envs * config.horizon)

@@ -62,6 +62,7 @@ class EnvState:
     phase: jax.Array  # [] control frames since the start of the reference's first cycle
     step: jax.Array  # [] int32, control steps since the episode began
     variant: jax.Array  # [] int32, which compiled model it runs
+    scale: jax.Array | None = None  # [] that multiplies the sizes of the bounds; None: 1
 
 
 @struct.dataclass
@@ -227,11 +228,12 @@ def make(
         before, ctrl = state.sim, control(state, action)
         sim = physics.step(model, state.variant, state.sim, ctrl)
         dphase = jnp.float32(1.0)
-        state = EnvState(sim, state.phase + dphase, state.step + 1, state.variant)
+        state = EnvState(sim, state.phase + dphase, state.step + 1, state.variant, state.scale)
         seen = look(state)
         errors = bounds_lib.errors(layout, seen.offset, seen.bodies, seen.reference, seen.effectors)
         within = state.phase % motion.length if motion.loop else state.phase
         sizes = bounds_lib.sizes(bounds, within / motion.length)
+        sizes = sizes if state.scale is None else state.scale * sizes
         clear = ground.clearance(shapes, seen.bodies)
         fallen = jnp.any(clear[no_touch] <= 0.0)
         touching = jnp.any(clear[forbidden] <= 0.0)

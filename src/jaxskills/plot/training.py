@@ -16,6 +16,7 @@ from jaxskills.plot.sheet import (
     GREY,
     ORANGE,
     PHASE,
+    RED,
     finish,
     foremost,
     legend_beside,
@@ -46,6 +47,14 @@ def learning_curve(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
             axes.plot(samples[seen], values[seen], "o-", color=colour, ms=3, lw=1, label=label)
     axes.set_xlim(left=0.0)
     axes.set_ylim(bottom=0.0)
+    scale = _column(metrics, "bound_scale")
+    if np.isfinite(scale).any():
+        right = axes.twinx()
+        right.plot(samples, scale, color=RED, lw=1)
+        right.set_ylim(bottom=0.0)
+        right.set_ylabel("scale of the bounds", fontsize=9, color=RED)
+        right.tick_params(labelsize=8)
+        right.spines[["top", "left"]].set_visible(False)
     last = metrics[-1]
     told = f"Learning curve: {last['samples'] / 1e6:.3g} million samples, {_duration(last)}"
     finish(axes, told, "samples (millions)", "mean length of an episode (s)")
