@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import tiny
 
-from jaxskills import character, ground, kinematics, motion, pose
+from jaxskills import character, ground, kinematics, motion, pose, trainer
 from jaxskills.character import Character
 from jaxskills.compilation import jit
 from jaxskills.env import bounds, core
@@ -401,6 +401,59 @@ def test_the_torque_at_the_start_of_a_step_is_within_its_limits(who: Character):
     np.testing.assert_allclose(np.asarray(ctrl)[free], np.asarray(wanted)[free], atol=1e-5)
 
 
+@pytest.fixture(scope="module")
+def fine(tmp_path_factory: pytest.TempPathFactory) -> trainer.Trainer:
+    """A training of the walker whose servos are told in every physics step."""
+    folder = tmp_path_factory.mktemp("fine")
+    return trainer.make(tiny.train_config(folder, env=EnvConfig(servo_every="physics")))
+
+
+def test_servos_told_every_physics_step_are_pd_with_clipped_torques(
+    who: Character, fine: trainer.Trainer
+):
+    """Against C MuJoCo by hand: kp (target - q) + kd (speed - v), by MuJoCo's own difference."""
+    state = jit(fine.env.start)(jnp.float32(0.0))
+    turned, action = np.array(state.sim.qpos, float), np.array([0.9, -0.6, 0.3, 0.6, -0.5])
+    mujoco.mj_integratePos(who.model, turned, np.array([0.0] * 6 + [1.2, 0.8, -0.9, 0, 0]), 1.0)
+    state = dataclasses.replace(
+        state, sim=dataclasses.replace(state.sim, qpos=jnp.asarray(turned, jnp.float32))
+    )
+    model = character.compile(who, CONTROL_DT / 4)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state.sim.qpos, state.sim.qvel
+    base, speed = motion.sample(who.layout, fine.motion, jnp.float32(EnvConfig().lead))
+    target = np.array(base, float)
+    mujoco.mj_integratePos(model, target, np.concatenate((np.zeros(6), action)), 1.0)
+    clipped, error, vector = [], np.zeros(model.nv), np.zeros(3)
+    for _ in range(4):
+        mujoco.mj_differentiatePos(model, error, 1.0, data.qpos, target)
+        torque = who.kp * error[6:] + who.kd * (np.asarray(speed) - data.qvel)[6:]
+        clipped.append(np.abs(torque) > who.torque)
+        torque = np.clip(torque, -who.torque, who.torque)
+        mujoco.mju_quat2Vel(vector, data.qpos[tiny.SPINE], 1.0)
+        now = np.concatenate((vector, data.qpos[tiny.LEFT_HIP :]))
+        data.ctrl[:] = now + (torque + who.kd * data.qvel[6:]) / who.kp
+        mujoco.mj_step(model, data)
+    assert 0.1 < np.mean(clipped) < 0.9
+    after, _ = jit(fine.env.step)(state, jnp.asarray(action, jnp.float32))
+    assert data.time == pytest.approx(CONTROL_DT)
+    np.testing.assert_allclose(after.sim.qpos, data.qpos, atol=1e-4)
+    np.testing.assert_allclose(after.sim.qvel, data.qvel, atol=2e-2)
+
+
+def test_servos_told_every_physics_step_speed_light_limbs_up_faster(
+    who: Character, fine: trainer.Trainer, walker: Running
+):
+    """A leg swings in the air; its damping takes back what a set point held for a step gives."""
+    state, push = walker.start(jnp.float32(0.0)), _push(3, 2.0)
+    sim = dataclasses.replace(state.sim, qpos=state.sim.qpos.at[2].add(1.0), qvel=jnp.zeros(11))
+    state = dataclasses.replace(state, sim=sim)
+    limit = float((who.torque / who.kd)[3])  # 5 rad/s
+    fast = float(jit(fine.env.step)(state, push)[0].sim.qvel[9])
+    slow = float(walker.step(state, push)[0].sim.qvel[9])
+    assert 0.5 * limit < slow < limit < fast
+
+
 def test_the_reported_torque_is_the_engines(who: Character):
     timestep = CONTROL_DT / 4
     model = character.compile(who, timestep)
@@ -431,6 +484,10 @@ def test_the_report_says_which_torque_was_applied(walker: Running):
         (EnvConfig(substeps=101), "env.substeps is 101: give 1 to 100 (20 is 600 Hz)"),
         (EnvConfig(seconds=0.0), "env.seconds is 0.0: give 1/30 to 3600 s"),
         (EnvConfig(seconds=float("nan")), "env.seconds is nan: give 1/30 to 3600 s"),
+        (
+            EnvConfig(servo_every="frame"),  # pyright: ignore[reportArgumentType]
+            "unknown env.servo_every 'frame': choose one of control, physics",
+        ),
         (EnvConfig(lead=31.0), "env.lead is 31.0: give -30 to 30 control frames"),
     ],
 )

@@ -20,7 +20,7 @@ from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import observe, rewards
 from jaxskills.env import style as style_lib
-from jaxskills.errors import UserError
+from jaxskills.errors import UserError, unknown
 from jaxskills.kinematics import Bodies
 from jaxskills.motion import CONTROL_DT, Motion, sample
 from jaxskills.physics import Physics, SimState, servo
@@ -43,6 +43,9 @@ class EnvConfig:
     # The target also runs ahead by kd/kp times the reference's speed: without that a servo with the
     # DeepMimic gains lags by 0.1 s, and a run leaves its bounds within 0.1 s by its knees alone.
     velocity_feedforward: bool = True
+    # When the servos' torques are limited: once a control step, or in every physics step as in SB,
+    # which lets limbs speed up as fast as their torque allows (see `physics.servo`).
+    servo_every: Literal["control", "physics"] = "control"
     feedforward: bool = True  # off: displacements are from the zero pose, not from the reference
     # What a step inside the bounds earns: 1, DeepMimic's imitation, a style (SB eq. 8), or both
     # weighted (SB eq. 13, for comparison).
@@ -127,7 +130,7 @@ def make(
     Args:
       character: who.
       motion: the reference.
-      physics: the engine's functions.
+      physics: the engine's functions; a step of them is `steps_per_call(config)` physics steps.
       model: what `physics.load` returned.
       bounds: sizes of the spacetime bounds.
       config: what an episode is.
@@ -198,6 +201,26 @@ def make(
             servos, layout, state.sim.qpos, state.sim.qvel, pose.plus(layout, base, d)
         )
 
+    def follow(state: EnvState, action: jax.Array) -> tuple[SimState, jax.Array]:
+        base, speed = neutral, jnp.zeros(layout.nv)
+        if config.feedforward:
+            base, ahead = sample(layout, motion, state.phase + config.lead)
+            speed = ahead if config.velocity_feedforward else speed
+        target = pose.plus(layout, base, jnp.zeros(layout.nv).at[dofs].set(action))
+
+        def substep(sim: SimState, _: None) -> tuple[SimState, jax.Array]:
+            ctrl = servo.follow(servos, layout, sim.qpos, sim.qvel, target, speed)
+            return physics.step(model, state.variant, sim, ctrl), ctrl
+
+        sim, ctrl = jax.lax.scan(substep, state.sim, None, length=config.substeps)
+        return sim, ctrl[-1]
+
+    def advance(state: EnvState, action: jax.Array) -> tuple[SimState, jax.Array]:
+        if config.servo_every == "physics":
+            return follow(state, action)
+        ctrl = control(state, action)
+        return physics.step(model, state.variant, state.sim, ctrl), ctrl
+
     def imitation(seen: _Seen) -> jax.Array:
         return rewards.imitation(
             weights,
@@ -225,8 +248,8 @@ def make(
         return jnp.float32(1.0)
 
     def step(state: EnvState, action: jax.Array) -> tuple[EnvState, Outcome]:
-        before, ctrl = state.sim, control(state, action)
-        sim = physics.step(model, state.variant, state.sim, ctrl)
+        before = state.sim
+        sim, ctrl = advance(state, action)
         dphase = jnp.float32(1.0)
         state = EnvState(sim, state.phase + dphase, state.step + 1, state.variant, state.scale)
         seen = look(state)
@@ -269,6 +292,11 @@ def make(
     return Environment(start, place, observe_state, step, len(dofs), endings, length, end)
 
 
+def steps_per_call(config: EnvConfig) -> int:
+    """Returns how many physics steps the engine takes under the same controls."""
+    return 1 if config.servo_every == "physics" else config.substeps
+
+
 def validate(config: EnvConfig) -> None:
     """Checks a configuration.
 
@@ -279,6 +307,8 @@ def validate(config: EnvConfig) -> None:
         raise UserError(f"env.substeps is {config.substeps}: give 1 to 100 (20 is 600 Hz)")
     if not CONTROL_DT <= config.seconds <= 3600:
         raise UserError(f"env.seconds is {config.seconds}: give 1/30 to 3600 s")
+    if config.servo_every not in ("control", "physics"):
+        raise unknown("env.servo_every", config.servo_every, ("control", "physics"))
     styled = config.reward in ("style", "blend")
     if styled != (config.style.style != "none"):
         raise UserError(
