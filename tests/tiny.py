@@ -115,8 +115,8 @@ def write_clip(folder: Path) -> Path:
 
 
 def make_physics(who: Character, substeps: int = 4) -> tuple[Physics, object]:
-    """Returns the cpu physics on one thread and the loaded model."""
-    engine = physics_lib.make("cpu", substeps, num_envs=1, threads=1)
+    """Returns the cpu physics on one thread and the model loaded for `substeps` a control step."""
+    engine = physics_lib.make("cpu", 1, num_envs=1, threads=1)
     return engine, engine.load([character.compile(who, motion.CONTROL_DT / substeps)])
 
 

@@ -96,7 +96,7 @@ def environment(
     """Returns the environment of a configuration, made for batches of `envs`."""
     core.validate(config.env)
     backend = physics_lib.default_backend() if config.backend == "auto" else config.backend
-    engine = physics_lib.make(backend, core.steps_per_call(config.env), num_envs=envs)
+    engine = physics_lib.make(backend, 1, num_envs=envs)
     timestep = CONTROL_DT / config.env.substeps
     model = engine.load([character_lib.compile(character, timestep)])
     bounds = bounds_lib.make(character, config.bounds)

@@ -20,7 +20,7 @@ from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import observe, rewards
 from jaxskills.env import style as style_lib
-from jaxskills.errors import UserError, unknown
+from jaxskills.errors import UserError
 from jaxskills.kinematics import Bodies
 from jaxskills.motion import CONTROL_DT, Motion, sample
 from jaxskills.physics import Physics, SimState, servo
@@ -40,12 +40,9 @@ class EnvConfig:
     substeps: int = 4  # physics steps in a control step of 1/30 s: 120 Hz
     seconds: float = 20.0  # longest episode, SB Table 1
     lead: float = 1.0  # control frames the feed-forward target is ahead of the state, FS eq. 4
-    # The target also runs ahead by kd/kp times the reference's speed: without that a servo with the
-    # DeepMimic gains lags by 0.1 s, and a run leaves its bounds within 0.1 s by its knees alone.
+    # The servos damp towards the reference's speed, not towards rest: otherwise they lag by kd/kp,
+    # 0.1 s for DeepMimic's gains, and a run leaves its bounds within 0.1 s by its knees alone.
     velocity_feedforward: bool = True
-    # When the servos' torques are limited: once a control step, or in every physics step as in SB,
-    # which lets limbs speed up as fast as their torque allows (see `physics.servo`).
-    servo_every: Literal["control", "physics"] = "control"
     feedforward: bool = True  # off: displacements are from the zero pose, not from the reference
     # What a step inside the bounds earns: 1, DeepMimic's imitation, a style (SB eq. 8), or both
     # weighted (SB eq. 13, for comparison).
@@ -130,7 +127,7 @@ def make(
     Args:
       character: who.
       motion: the reference.
-      physics: the engine's functions; a step of them is `steps_per_call(config)` physics steps.
+      physics: the engine's functions; a step of them is one physics step.
       model: what `physics.load` returned.
       bounds: sizes of the spacetime bounds.
       config: what an episode is.
@@ -190,18 +187,7 @@ def make(
     def observe_state(state: EnvState) -> jax.Array:
         return features(state, look(state))
 
-    def control(state: EnvState, action: jax.Array) -> jax.Array:
-        base = neutral
-        if config.feedforward:
-            base, speed = sample(layout, motion, state.phase + config.lead)
-            if config.velocity_feedforward:
-                action = action + servos.kd / servos.kp * speed[dofs]
-        d = jnp.zeros(layout.nv).at[dofs].set(action)
-        return servo.set_point(
-            servos, layout, state.sim.qpos, state.sim.qvel, pose.plus(layout, base, d)
-        )
-
-    def follow(state: EnvState, action: jax.Array) -> tuple[SimState, jax.Array]:
+    def advance(state: EnvState, action: jax.Array) -> tuple[SimState, jax.Array]:
         base, speed = neutral, jnp.zeros(layout.nv)
         if config.feedforward:
             base, ahead = sample(layout, motion, state.phase + config.lead)
@@ -209,17 +195,11 @@ def make(
         target = pose.plus(layout, base, jnp.zeros(layout.nv).at[dofs].set(action))
 
         def substep(sim: SimState, _: None) -> tuple[SimState, jax.Array]:
-            ctrl = servo.follow(servos, layout, sim.qpos, sim.qvel, target, speed)
+            ctrl = servo.controls(servos, layout, sim.qpos, sim.qvel, target, speed)
             return physics.step(model, state.variant, sim, ctrl), ctrl
 
         sim, ctrl = jax.lax.scan(substep, state.sim, None, length=config.substeps)
         return sim, ctrl[-1]
-
-    def advance(state: EnvState, action: jax.Array) -> tuple[SimState, jax.Array]:
-        if config.servo_every == "physics":
-            return follow(state, action)
-        ctrl = control(state, action)
-        return physics.step(model, state.variant, state.sim, ctrl), ctrl
 
     def imitation(seen: _Seen) -> jax.Array:
         return rewards.imitation(
@@ -292,11 +272,6 @@ def make(
     return Environment(start, place, observe_state, step, len(dofs), endings, length, end)
 
 
-def steps_per_call(config: EnvConfig) -> int:
-    """Returns how many physics steps the engine takes under the same controls."""
-    return 1 if config.servo_every == "physics" else config.substeps
-
-
 def validate(config: EnvConfig) -> None:
     """Checks a configuration.
 
@@ -307,8 +282,6 @@ def validate(config: EnvConfig) -> None:
         raise UserError(f"env.substeps is {config.substeps}: give 1 to 100 (20 is 600 Hz)")
     if not CONTROL_DT <= config.seconds <= 3600:
         raise UserError(f"env.seconds is {config.seconds}: give 1/30 to 3600 s")
-    if config.servo_every not in ("control", "physics"):
-        raise unknown("env.servo_every", config.servo_every, ("control", "physics"))
     styled = config.reward in ("style", "blend")
     if styled != (config.style.style != "none"):
         raise UserError(

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Servo set points with limited torque, the same for every backend.
+"""Servos with limited torque, the same for every backend.
 
 The servos themselves run inside the engine (see `character.compile`). Torque is limited by keeping
-the set point within torque/kp of the joint: a clamped actuator would lose its implicit damping.
-
-A set point made for a whole control step limits the torque at its beginning only. From there on
-damping takes it back as the joint gains speed, so that a joint can change its speed by no more than
-torque/kd in a control step, 2.5 rad/s at a shoulder of `humanoid34`, however light the limb is.
-One made for each physics step (`follow`) has no such limit: it is stable PD with clipped torques.
+the set point near the joint: a clamped actuator would lose its implicit damping. It has to be made
+anew in each physics step. One that is held for a control step limits the torque at its beginning
+only; from there on damping takes it back as the joint gains speed, so that a joint can change its
+speed by no more than torque/kd, 2.5 rad/s at a shoulder of `humanoid34`, however light the limb is.
 """
 
 import jax
@@ -35,23 +33,7 @@ def of(character: Character) -> Servos:
     return Servos(*(jnp.asarray(x, jnp.float32) for x in numbers), dofs=dofs)
 
 
-def set_point(
-    servos: Servos, layout: pose.Layout, qpos: jax.Array, qvel: jax.Array, target: jax.Array
-) -> jax.Array:
-    """Returns the controls `[nu]` (rad) that pull the pose `qpos [nq]` towards `target [nq]`.
-
-    The whole torque kp (ctrl - q) - kd v is within the limit when the control step begins. Limiting
-    the first term alone would cap joint speeds at torque/kd, 3 rad/s at a knee that runs at 10.
-    """
-    dofs = jnp.array(servos.dofs)
-    now = pose.rotation_vectors(layout, qpos)[dofs]
-    error = pose.rotation_vectors(layout, target)[dofs] - now
-    damping = servos.kd * qvel[dofs]
-    low, high = (damping - servos.torque) / servos.kp, (damping + servos.torque) / servos.kp
-    return now + jnp.clip(error, low, high)
-
-
-def follow(
+def controls(
     servos: Servos,
     layout: pose.Layout,
     qpos: jax.Array,
