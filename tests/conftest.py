@@ -10,7 +10,7 @@ import pytest
 
 from jaxskills import physics
 from jaxskills.errors import UserError
-from jaxskills.paths import deepmimic_dir
+from jaxskills.paths import deepmimic_dirs
 
 # Before jax uses a device: MJX under vmap can wait for ever on two cores otherwise.
 physics.configure_cpu()
@@ -43,6 +43,6 @@ def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> None:
 def deepmimic() -> Path:
     """The folder of the DeepMimic motion files; tests that need it skip without the extra."""
     try:
-        return deepmimic_dir()
+        return deepmimic_dirs()[-1]
     except UserError as missing:
         pytest.skip(str(missing))

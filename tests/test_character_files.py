@@ -166,7 +166,7 @@ def test_gains_and_limits_are_mirrored(char):
 @needs_clips
 @pytest.mark.parametrize("clip", ["walk", "cartwheel", "backflip"])
 def test_kinematics_equal_those_of_the_motion_format(humanoid, clip):
-    text = (paths.deepmimic_dir() / f"humanoid3d_{clip}.txt").read_text()
+    text = (paths.deepmimic_dirs()[-1] / f"humanoid3d_{clip}.txt").read_text()
     frames = np.array(json.loads(text)["Frames"])
     data = mujoco.MjData(humanoid.model)
     for frame in frames:

@@ -343,10 +343,22 @@ def test_bvh_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_names_without_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setenv("JAXSKILLS_CLIP_DIR", str(tmp_path))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert clip.available() == ["sparse_jog"]
     write(tmp_path / "humanoid3d_hop.txt", [frame(), frame()])
     assert clip.available() == ["hop", "sparse_jog"]
     assert clip.load("hop").name == "hop"
+
+
+def test_own_clips_come_beside_the_extras_and_win(
+    deepmimic: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setenv("JAXSKILLS_CLIP_DIR", str(tmp_path))
+    write(tmp_path / "humanoid3d_hop.txt", [frame(), frame()])
+    assert {"hop", "walk"} <= set(clip.available())
+    assert clip.find("walk") == deepmimic / "humanoid3d_walk.txt"
+    write(tmp_path / "humanoid3d_walk.txt", [frame(), frame()])
+    assert clip.find("walk") == tmp_path / "humanoid3d_walk.txt"
 
 
 @pytest.mark.parametrize(

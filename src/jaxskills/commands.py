@@ -226,7 +226,7 @@ def clips_list() -> Answer:
         for row in rows
     ]
     try:
-        paths.deepmimic_dir()
+        paths.deepmimic_dirs()
     except UserError as missing:
         lines.append(str(missing))
     return Answer("\n".join(lines), {"clips": rows})

@@ -23,27 +23,29 @@ def data_dir() -> Path:
     return shipped("data")
 
 
-def deepmimic_dir() -> Path:
-    """Returns the folder of the DeepMimic motion files (`humanoid3d_*.txt`).
+def deepmimic_dirs() -> list[Path]:
+    """Returns the folders of DeepMimic motion files (`humanoid3d_*.txt`), the first to win first.
 
-    `JAXSKILLS_CLIP_DIR` wins; otherwise the `pybullet_data` package of the `clips` extra. Only
-    its files are read: the simulator is never imported.
+    The user's own, named by `JAXSKILLS_CLIP_DIR`, then that of the `pybullet_data` package of the
+    `clips` extra. Only its files are read: the simulator is never imported.
 
     Raises:
       UserError: neither is there; the message names the extra and the variable.
     """
-    named = os.environ.get(CLIP_DIR_VARIABLE)
+    named, folders = os.environ.get(CLIP_DIR_VARIABLE), []
     if named:
         if not Path(named).is_dir():
             raise UserError(f"{CLIP_DIR_VARIABLE}='{named}' is not a folder: name one with clips")
-        return Path(named)
+        folders.append(Path(named))
     spec = importlib.util.find_spec("pybullet_data")
-    if spec is None or spec.origin is None:
+    if spec is not None and spec.origin is not None:
+        folders.append(Path(spec.origin).parent / "data" / "motions")
+    if not folders:
         raise UserError(
             "the DeepMimic motion files are not installed: run pip install 'jaxskills[clips]',"
             f" or set {CLIP_DIR_VARIABLE} to a folder that holds them"
         )
-    return Path(spec.origin).parent / "data" / "motions"
+    return folders
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -47,10 +47,10 @@ def find(name: str | Path) -> Path:
             return shipped
     if path.is_file():
         raise UserError(f"clip '{path}' is of no known format: use one of {', '.join(_READERS)}")
-    folder = paths.deepmimic_dir()
-    for candidate in (folder / f"{_PREFIX}{name}.txt", folder / f"{name}.txt"):
-        if candidate.is_file():
-            return candidate
+    for folder in paths.deepmimic_dirs():
+        for candidate in (folder / f"{_PREFIX}{name}.txt", folder / f"{name}.txt"):
+            if candidate.is_file():
+                return candidate
     raise unknown("clip", name, (*available(), "FILE.bvh", "FILE.txt"))
 
 
@@ -59,11 +59,12 @@ def available() -> list[str]:
     shipped = paths.data_dir() / "clips"
     names = [path.stem for path in shipped.glob("*") if path.suffix in (".toml", ".npz")]
     try:
-        folder = paths.deepmimic_dir()
+        folders = paths.deepmimic_dirs()
     except UserError:
         return sorted(names)
-    names += [path.stem.removeprefix(_PREFIX) for path in folder.glob(f"{_PREFIX}*.txt")]
-    names += [f"walker/{path.stem}" for path in (folder / "walker").glob("*.txt")]
+    for folder in folders:
+        names += [path.stem.removeprefix(_PREFIX) for path in folder.glob(f"{_PREFIX}*.txt")]
+        names += [f"walker/{path.stem}" for path in (folder / "walker").glob("*.txt")]
     return sorted(set(names))
 
 
