@@ -27,6 +27,8 @@ SMALL = (
     *("--networks.policy", "16", "--networks.value", "16"),
 )
 
+GRAM = "--env.reward style --env.style.style gram"
+
 Capture = pytest.CaptureFixture[str]
 
 
@@ -86,6 +88,7 @@ def digest(folder: Path) -> str:
         (("train", "none.bvh", "--out", "run"), "clip 'none.bvh' does not exist"),
         (("train", "walk", "--out", "run", "--resume"), "'run' is not a run"),
         (("evaluate", "run"), "'run' is not a run"),
+        (("evaluate", "run", "--style-clip", "wlak"), "unknown clip 'wlak': choose one of "),
         (("render", "run", "--out", "film.mp4"), "'run' is not a run"),
         (("render", "run", "--out", "film.avi"), "'film.avi': choose one of .mp4, .gif, .png"),
         (
@@ -126,6 +129,13 @@ def test_mistyped(
         ("--ppo.policy-lr nan", "ppo.policy_lr is nan"),
         ("--starts.uniform 2", "starts.uniform is 2.0"),
         ("--character dog", "unknown character 'dog': choose one of "),
+        ("--env.reward style --env.style.style gram", "style.style_clip is None: gram needs"),
+        (f"{GRAM} --env.style.style-clip wlak", "unknown clip 'wlak': choose one of "),
+        (f"{GRAM} --env.style.style-clip sparse_jog", "character 'walker' has others"),
+        (
+            f"{GRAM} --env.style.style-clip sparse_jog --env.style.autoencoder none.npz",
+            "autoencoder 'none.npz' does not exist",
+        ),
     ],
 )
 def test_settings_out_of_range(
@@ -224,6 +234,8 @@ def test_evaluate_prints_one_json_object(finished: Path, capfd: Capture):
     assert names <= set(found)
     assert (found["episodes"], found["samples"]) == (4, 64)
     assert 0 < found["seconds_mean"] <= 1
+    assert found["energy_mean"] > 0 < found["reference_energy_mean"]
+    assert found["volume_mean"] >= 0 <= found["reference_volume_mean"]
     assert digest(finished) == before
 
 

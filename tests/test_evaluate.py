@@ -24,7 +24,7 @@ def _trace(fallen: list[list[int]], outside: list[list[int]]) -> Trace:
     """Returns a trace whose rows are episodes."""
     by_step = lambda rows: jnp.asarray(np.array(rows, bool).T)  # noqa: E731
     nothing = dict.fromkeys(
-        ("qpos", "phase", "errors", "sizes", "com", "torque", "over"), jnp.zeros(())
+        ("qpos", "qvel", "phase", "errors", "sizes", "com", "torque", "over"), jnp.zeros(())
     )
     return Trace(inside=~by_step(outside), fallen=by_step(fallen), **nothing)
 
@@ -79,6 +79,7 @@ def run(standing: trainer.Trainer) -> Callable[[], Trace]:
 def test_a_walker_that_stands_stands(run: Callable[[], Trace]):
     trace = run()
     assert trace.qpos.shape == (60, 3, 13)
+    assert trace.qvel.shape == (60, 3, 11)
     assert trace.errors.shape == trace.sizes.shape == (60, 3, 10)
     np.testing.assert_allclose(np.diff(trace.phase, axis=0), 1.0, atol=1e-4)
     found = evaluate.summary(trace)

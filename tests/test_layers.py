@@ -24,11 +24,12 @@ kinematics ground motion
 
 physics.quiet physics.ffi physics.base physics.cpu physics.box_floor physics.explicit
 physics.mjx physics.servo physics
-env.observe env.bounds env.bounds_file env.rewards env.style env.core env
-learn.networks learn.normalize learn.gae learn.ppo learn.rollout learn
+env.observe env.bounds env.bounds_file env.rewards env.style env.gram env.core env
+learn.networks learn.normalize learn.windows learn.autoencoder learn.gae learn.ppo learn.rollout
+learn
 explore.starts explore.evolution explore.adaptive explore
 
-trainer checkpoint evaluate train
+trainer checkpoint evaluate style_measures train
 render.opengl render.stage render.take render.video render.strip render
 plot.sheet plot.states plot.training plot.starts plot playback provenance
 

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from jaxskills.env import style
 from jaxskills.env.style import StyleConfig
 from jaxskills.errors import UserError
-from jaxskills.kinematics import Bodies
+from jaxskills.kinematics import Bodies, BodyParams
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
 
@@ -72,8 +72,30 @@ def test_the_regulariser_by_hand():
 
 @pytest.mark.parametrize(
     ("change", "says"),
-    [({"energy": (5.0, 5.0)}, "style.energy is"), ({"volume": 0.0}, "style.volume is 0.0")],
+    [
+        ({"energy": (5.0, 5.0)}, "style.energy is"),
+        ({"volume": 0.0}, "style.volume is 0.0"),
+        ({"gram": -1.0}, "style.gram is -1.0: give a positive number"),
+        ({"style": "gram"}, "style.style is gram, style.style_clip is None: gram needs the clip"),
+        ({"style": "energy_up", "style_clip": "walk"}, "style.style is energy_up, .* is walk"),
+        ({"look_back": 0.0}, "style.look_back is 0.0: give 1/30 to 60 s, or None"),
+        ({"look_back": float("nan")}, "style.look_back is nan"),
+    ],
 )
 def test_out_of_range(change: dict, says: str):
-    with pytest.raises(UserError, match=says):
+    with pytest.raises(UserError, match=says) as raised:
         style.validate(StyleConfig(**change))
+    assert "\n" not in str(raised.value)
+
+
+def test_likeness_takes_the_place_of_the_style():
+    """Still bodies have no energy and no accelerations, so the regulariser is 1."""
+    bodies = _still(CUBE)
+    zero, count = jnp.zeros, len(CUBE)
+    params = BodyParams(
+        *(zero((count + 1, 3)), zero((count + 1, 3, 3)), zero((1, 3)), zero((1, 3))),
+        *(jnp.ones(count), zero((count, 3)), zero((count, 3)), zero((count, 3, 3))),
+    )
+    config = StyleConfig(style="gram", style_clip="some")
+    found = style.reward(config, params, bodies, bodies, zero(3), jnp.float32(0.7))
+    assert float(found) == pytest.approx(0.7)

@@ -46,6 +46,8 @@ class Evaluate:
     """Physics steps per control step of 1/30 s (20: 600 Hz). None: as in the training."""
     seed: int = 1
     """Seed of the phases at which episodes start."""
+    style_clip: str | None = None
+    """A clip, by name or file: also say how far from its style. None: the one the run wanted."""
     backend: Backend = "auto"
     """Physics engine; auto takes the best one for this machine, whatever the run learnt on."""
     json: Flag = False

@@ -24,6 +24,7 @@ from jaxskills import (
     progress,
     recipes,
     render,
+    style_measures,
 )
 from jaxskills import character as character_lib
 from jaxskills import evaluate as evaluate_lib
@@ -78,9 +79,7 @@ def settings(recipe: Recipe | None) -> TrainConfig:
     if recipe is None:
         return TrainConfig()
     config = recipe.config or TrainConfig()
-    return dataclasses.replace(
-        config, clip=_absolute(recipe.clip), character=_absolute(recipe.character)
-    )
+    return _located(dataclasses.replace(config, clip=recipe.clip, character=recipe.character))
 
 
 def settings_of(command: arguments.Train, config: TrainConfig) -> TrainConfig:
@@ -111,9 +110,7 @@ def settings_of(command: arguments.Train, config: TrainConfig) -> TrainConfig:
 
 def train(command: arguments.Train, config: TrainConfig) -> Answer:
     """Learns, then films the result into the run folder."""
-    config = dataclasses.replace(
-        config, clip=_absolute(config.clip), character=_absolute(config.character)
-    )
+    config = _located(config)
     run, name = command.out, recipes.find(command.skill).name
     done = max(checkpoint.existing(run), default=0) if command.resume else 0
     print(f"{name}: compiling, which takes half a minute the first time", file=sys.stderr)
@@ -133,6 +130,8 @@ def train(command: arguments.Train, config: TrainConfig) -> Answer:
 
 def evaluate(command: arguments.Evaluate) -> Answer:
     """Measures the controller of a run."""
+    if command.style_clip is not None:
+        clip.find(command.style_clip)  # a mistake is said at once
     made, state = _open(command.run, command.backend)
     config = evaluate_lib.EvaluateConfig(
         command.seconds, command.episodes, command.substeps, command.seed
@@ -143,9 +142,10 @@ def evaluate(command: arguments.Evaluate) -> Answer:
         "samples": int(state.samples),
         **dataclasses.asdict(config),
         "substeps": config.substeps or made.config.env.substeps,
+        **style_measures.style_measures(made, trace, command.style_clip),
     }
     data = {key: value for key, value in data.items() if value is not None}
-    lines = [f"{key:20} {value:.4g}" for key, value in data.items()]
+    lines = [f"{key:28} {value:.4g}" for key, value in data.items()]
     return Answer("\n".join(lines), data)
 
 
@@ -206,6 +206,19 @@ def _metrics(path: Path) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             break
     return rows
+
+
+def _located(config: TrainConfig) -> TrainConfig:
+    """Returns the settings with the full path of every file they name."""
+    style = config.env.style
+    files = {
+        name: None if value is None else _absolute(value)
+        for name, value in (("style_clip", style.style_clip), ("autoencoder", style.autoencoder))
+    }
+    env = dataclasses.replace(config.env, style=dataclasses.replace(style, **files))
+    return dataclasses.replace(
+        config, env=env, clip=_absolute(config.clip), character=_absolute(config.character)
+    )
 
 
 def _absolute(name: str) -> str:

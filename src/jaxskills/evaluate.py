@@ -42,6 +42,7 @@ class Trace:
     """T steps of E evaluated episodes, going on after a fall."""
 
     qpos: jax.Array  # [T, E, nq]
+    qvel: jax.Array  # [T, E, nv]
     phase: jax.Array  # [T, E] control frames
     errors: jax.Array  # [T, E, K] m or rad
     sizes: jax.Array  # [T, E, K] of the bounds
@@ -97,6 +98,7 @@ def run(env: Environment, nets: Networks, state: TrainState, phase: jax.Array, s
         over = states.phase > env.end
         seen = Trace(
             states.sim.qpos,
+            states.sim.qvel,
             states.phase,
             report.errors,
             report.sizes,

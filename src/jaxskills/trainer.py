@@ -6,6 +6,7 @@
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -21,12 +22,12 @@ from jaxskills import physics as physics_lib
 from jaxskills import pose, retarget
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
-from jaxskills.env import core
+from jaxskills.env import core, gram
 from jaxskills.errors import UserError
 from jaxskills.explore import adaptive as adaptive_lib
 from jaxskills.explore import evolution as evolution_lib
 from jaxskills.explore import starts as starts_lib
-from jaxskills.learn import gae, normalize, rollout
+from jaxskills.learn import autoencoder, gae, normalize, rollout
 from jaxskills.learn import networks as networks_lib
 from jaxskills.learn import ppo as ppo_lib
 from jaxskills.motion import CONTROL_DT, Motion
@@ -100,7 +101,24 @@ def environment(
     timestep = CONTROL_DT / config.env.substeps
     model = engine.load([character_lib.compile(character, timestep)])
     bounds = bounds_lib.make(character, config.bounds)
-    return core.make(character, motion, engine, model, bounds, config.env)
+    clip = config.env.style.style_clip
+    wanted = None if clip is None else style(config, character, motion, clip)
+    return core.make(character, motion, engine, model, bounds, config.env, wanted)
+
+
+def style(config: TrainConfig, character: Character, motion: Motion, clip: str) -> gram.Style:
+    """Returns the style of a clip, for a character that follows `motion`.
+
+    How fast the root moves is no part of it: the reference and its bounds settle that.
+
+    Raises:
+      UserError: a broken clip, or an autoencoder that is missing or of other bodies.
+    """
+    wanted = config.env.style
+    model = autoencoder.load(wanted.autoencoder or autoencoder.shipped(), character)
+    shown = reference(dataclasses.replace(config, clip=clip), character)
+    encode = functools.partial(autoencoder.style, model)
+    return gram.make(character, motion, shown, encode, model.width, wanted.look_back)
 
 
 def make(config: TrainConfig) -> Trainer:

@@ -18,7 +18,7 @@ from flax import struct
 from jaxskills import ground, kinematics, pose
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
-from jaxskills.env import observe, rewards
+from jaxskills.env import gram, observe, rewards
 from jaxskills.env import style as style_lib
 from jaxskills.errors import UserError
 from jaxskills.kinematics import Bodies
@@ -63,6 +63,7 @@ class EnvState:
     step: jax.Array  # [] int32, control steps since the episode began
     variant: jax.Array  # [] int32, which compiled model it runs
     scale: jax.Array | None = None  # [] that multiplies the sizes of the bounds; None: 1
+    window: gram.Window | None = None  # the motion up to now, if the style is gram
 
 
 @struct.dataclass
@@ -121,6 +122,7 @@ def make(
     model: object,
     bounds: bounds_lib.Bounds,
     config: EnvConfig,
+    wanted: gram.Style | None = None,
 ) -> Environment:
     """Returns the environment of a character that follows `motion`.
 
@@ -131,8 +133,11 @@ def make(
       model: what `physics.load` returned.
       bounds: sizes of the spacetime bounds.
       config: what an episode is.
+      wanted: the style, if it is gram.
     """
     validate(config)
+    if (wanted is None) == (config.style.style == "gram"):
+        raise UserError(f"env.style.style is {config.style.style}: only gram comes with a style")
     layout, tree = character.layout, kinematics.tree(character.model)
     params, shapes = kinematics.body_params(character.model), ground.shapes(character.model)
     servos, weights = servo.of(character), rewards.imitation_weights(character)
@@ -182,7 +187,8 @@ def make(
         lowest = jnp.min(ground.clearance(shapes, bodies_of(qpos, qvel)))
         qpos = qpos.at[2].add(jnp.maximum(_LIFT_MARGIN - lowest, 0.0))
         sim = physics.init(model, jnp.int32(0), qpos, qvel)
-        return EnvState(sim, phase, jnp.int32(0), jnp.int32(0))
+        window = None if wanted is None else gram.fill(wanted, phase)
+        return EnvState(sim, phase, jnp.int32(0), jnp.int32(0), window=window)
 
     def observe_state(state: EnvState) -> jax.Array:
         return features(state, look(state))
@@ -211,13 +217,16 @@ def make(
             seen.reference,
         )
 
-    def style(seen: _Seen, before: SimState, after: SimState) -> jax.Array:
+    def style(seen: _Seen, before: SimState, after: EnvState) -> jax.Array:
         earlier = bodies_of(before.qpos, before.qvel)
-        change = (after.qvel - before.qvel) / CONTROL_DT
-        joints = [jnp.linalg.norm(change[np.array(j.dofs)]) for j in layout.joints[1:]]
-        return style_lib.reward(config.style, params, seen.bodies, earlier, jnp.stack(joints))
+        change = (after.sim.qvel - before.qvel) / CONTROL_DT
+        joints = jnp.stack([jnp.linalg.norm(change[np.array(j.dofs)]) for j in layout.joints[1:]])
+        likeness = None
+        if wanted is not None and after.window is not None:
+            likeness = gram.reward(wanted, after.window, config.style.gram)
+        return style_lib.reward(config.style, params, seen.bodies, earlier, joints, likeness)
 
-    def reward_of(seen: _Seen, before: SimState, after: SimState) -> jax.Array:
+    def reward_of(seen: _Seen, before: SimState, after: EnvState) -> jax.Array:
         if config.reward == "imitation":
             return imitation(seen)
         if config.reward == "style":
@@ -231,8 +240,11 @@ def make(
         before = state.sim
         sim, ctrl = advance(state, action)
         dphase = jnp.float32(1.0)
-        state = EnvState(sim, state.phase + dphase, state.step + 1, state.variant, state.scale)
+        state = dataclasses.replace(state, sim=sim, phase=state.phase + dphase, step=state.step + 1)
         seen = look(state)
+        if wanted is not None and state.window is not None:
+            window = gram.push(wanted, state.window, params, seen.bodies)
+            state = dataclasses.replace(state, window=window)
         errors = bounds_lib.errors(layout, seen.offset, seen.bodies, seen.reference, seen.effectors)
         within = state.phase % motion.length if motion.loop else state.phase
         sizes = bounds_lib.sizes(bounds, within / motion.length)
@@ -261,7 +273,7 @@ def make(
         outcome = Outcome(
             obs=features(state, seen),
             rate=jnp.float32(0.0),
-            spike=jnp.where(terminated, 0.0, reward_of(seen, before, sim)),
+            spike=jnp.where(terminated, 0.0, reward_of(seen, before, state)),
             dphase=dphase,
             terminated=terminated,
             truncated=truncated & ~terminated,

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Style rewards from heuristics: how much energy, how much room (SB section 3.3, eq. 4, 5, 7, 8).
+"""Style rewards: how much energy, how much room, or like which clip (SB section 3.3, eq. 4 to 8).
 
 Spacetime bounds leave room inside of them; a style reward says which of the motions in that room is
-wanted. The reward of a step is style times regulariser, earned while inside the bounds.
+wanted. The reward of a step is style times regulariser, earned while inside the bounds. How like a
+clip a motion is, `gram.py` says.
 """
 
 import dataclasses
@@ -18,9 +19,10 @@ from jaxskills.errors import UserError
 from jaxskills.kinematics import Bodies, BodyParams
 from jaxskills.motion import CONTROL_DT
 
-Style = Literal["none", "energy_up", "energy_down", "volume_up", "volume_down"]
+Style = Literal["none", "energy_up", "energy_down", "volume_up", "volume_down", "gram"]
 
 _JITTER = 1e-4  # m, see `hull_volume`
+_LONGEST_LOOK = 60.0  # s
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +32,11 @@ class StyleConfig:
     style: Style = "none"
     energy: tuple[float, float] = (20.0, 100.0)  # J, SB section 5.3.1
     volume: float = 0.12  # m^3, alpha of SB eq. 5, section 5.3.1
+    style_clip: str | None = None  # for gram: name or file of the clip whose style is wanted
+    autoencoder: str | None = None  # for gram: npz file; None: the one shipped, for `humanoid34`
+    gram: float = 0.4  # alpha of SB eq. 6, for distances from 0 to 1.4, see `gram.distance`
+    # What the reward looks back over, in s; None: one cycle of the reference, SB section 5.3.2.
+    look_back: float | None = None
     # Scales beta of SB eq. 7, which the paper does not give, and the share of the energy in it.
     energy_scale: float = 400.0  # J
     linear_scale: float = 100.0  # m/s^2, of each body
@@ -57,9 +64,14 @@ def hull_volume(points: jax.Array) -> jax.Array:
 
 
 def reward(
-    config: StyleConfig, params: BodyParams, bodies: Bodies, before: Bodies, joints: jax.Array
+    config: StyleConfig,
+    params: BodyParams,
+    bodies: Bodies,
+    before: Bodies,
+    joints: jax.Array,
+    likeness: jax.Array | None = None,
 ) -> jax.Array:
-    """Returns style times regulariser `[]` in [0, 1] (SB eq. 4, 5, 7, 8).
+    """Returns style times regulariser `[]` in [0, 1] (SB eq. 4 to 8).
 
     Args:
       config: which style.
@@ -67,9 +79,11 @@ def reward(
       bodies: after the control step.
       before: before it, for accelerations.
       joints: `[J]` angular acceleration of each joint in rad/s^2.
+      likeness: `[]` for gram, the style itself (`gram.reward`).
     """
     level = kinematics.kinetic_energy(params, bodies)
-    return _style(config, level, bodies) * _regulariser(config, level, bodies, before, joints)
+    style = _style(config, level, bodies) if likeness is None else likeness
+    return style * _regulariser(config, level, bodies, before, joints)
 
 
 def _style(config: StyleConfig, level: jax.Array, bodies: Bodies) -> jax.Array:
@@ -106,6 +120,15 @@ def validate(config: StyleConfig) -> None:
     """
     if not 0 <= config.energy[0] < config.energy[1]:
         raise UserError(f"style.energy is {config.energy}: give 0 <= low < high, in J")
-    for name in ("volume", "energy_scale", "linear_scale", "angular_scale"):
+    for name in ("volume", "gram", "energy_scale", "linear_scale", "angular_scale"):
         if not getattr(config, name) > 0:
             raise UserError(f"style.{name} is {getattr(config, name)}: give a positive number")
+    if (config.style == "gram") != (config.style_clip is not None):
+        raise UserError(
+            f"style.style is {config.style}, style.style_clip is {config.style_clip}: gram needs"
+            " the clip whose style is wanted, and no other style takes one"
+        )
+    if config.look_back is not None and not CONTROL_DT <= config.look_back <= _LONGEST_LOOK:
+        raise UserError(
+            f"style.look_back is {config.look_back}: give 1/30 to {_LONGEST_LOOK:.0f} s, or None"
+        )
