@@ -60,7 +60,8 @@ def trace(plain: Trainer) -> Trace:
     phase = np.arange(1, 91)[:, None] + np.array([0.0, 7.3])
     at = jax.vmap(jax.vmap(lambda p: sample(plain.character.layout, plain.motion, p)))
     qpos, qvel = jit(at)(jnp.asarray(phase, jnp.float32))
-    nothing = dict.fromkeys(("phase", "errors", "sizes", "inside", "com", "torque"), jnp.zeros(()))
+    names = ("phase", "errors", "sizes", "inside", "com", "torque", "over")
+    nothing = dict.fromkeys(names, jnp.zeros(()))
     return Trace(qpos=qpos, qvel=qvel, fallen=jnp.zeros(phase.shape, bool), **nothing)
 
 
