@@ -4,7 +4,7 @@
     python experiments/autoencoder.py
 
 writes `data/autoencoder.npz`, for `humanoid34`, and what came out to
-`experiments/results/style/autoencoder.json`: how well clips are reconstructed that a first training
+`experiments/results/autoencoder.json`: how well clips are reconstructed that a first training
 leaves out, and how far apart the styles of clips are by the second one, which leaves out none. For
 another character, or with clips of your own:
 
@@ -33,7 +33,7 @@ from jaxskills.learn import autoencoder, windows
 from jaxskills.learn.autoencoder import Autoencoder, AutoencoderConfig
 from jaxskills.motion import Motion
 
-RESULTS = Path(__file__).parent / "results" / "style"
+RESULTS = Path(__file__).parent / "results"
 HELD_OUT = ("run", "dance_b", "spinkick")
 SHOWN = ("walk", "walker/0walk_forward", "run", "sparse_jog", "crawl", "dance_a", "spinkick")
 _LOSSES = 20  # points kept of the loss

@@ -9,11 +9,12 @@ left out, a run that was cut off goes on. `experiments/tables.py` makes the tabl
 """
 
 import argparse
+import json
 import sys
 from pathlib import Path
 from typing import NamedTuple
 
-from reproduce import RESULTS, keep, reproduce
+from reproduce import RESULTS, jaxskills, keep, reproduce
 
 
 class Case(NamedTuple):
@@ -21,6 +22,7 @@ class Case(NamedTuple):
 
     skill: str
     options: tuple[str, ...] = ()  # of `jaxskills train`, besides the recipe's
+    against: tuple[str, ...] = ()  # clips from whose style it is measured how far the skill is
 
 
 def _of(text: str) -> tuple[str, ...]:
@@ -53,6 +55,14 @@ def _styles(skill: str, samples: int) -> dict[str, Case]:
         reward = f" --env.reward style --env.style.style {style}"
         cases[style] = Case(skill, _of(most + reward))
     return cases
+
+
+def _transfers(skill: str, clips: tuple[str, ...], samples: int) -> dict[str, Case]:
+    """The style transfer of SB 5.3.2, and the skill without it in the same bounds."""
+    most = f"--samples {samples} --no-stop-when-learnt"
+    gram = f"{most} --env.reward style --env.style.style gram --env.style.style-clip"
+    cases = {"plain": Case(skill, _of(most), clips)}
+    return cases | {name: Case(skill, _of(f"{gram} {name}"), clips) for name in clips}
 
 
 def _blends(skill: str, style: str, samples: int) -> dict[str, Case]:
@@ -92,6 +102,7 @@ COMPARISONS: dict[str, dict[str, Case]] = {
     "sparse_jog": _poor("sparse_jog", 3_000_000),
     "cartwheel_styles": _styles("cartwheel_style", 8_000_000),
     "dance_styles": _styles("dance_style", 6_000_000),
+    "run_styles": _transfers("run_style", ("happy_walk", "bent_walk"), 4_000_000),
     "cartwheel_blend": _blends("cartwheel", "energy_down", 8_000_000),
 }
 
@@ -108,7 +119,15 @@ def main() -> None:
                 print(f"{name}/{label} is there", file=sys.stderr)
                 continue
             run = options.runs / name / label
-            keep(reproduce(case.skill, 0, run, case.options), run, RESULTS / name, label)
+            record = reproduce(case.skill, 0, run, case.options)
+            record["gram_distances"] = {clip: gram_distance(run, clip) for clip in case.against}
+            keep(record, run, RESULTS / name, label)
+
+
+def gram_distance(run: Path, clip: str) -> float | None:
+    """Returns how far the controller of a run is from the style of a clip; None if it fell."""
+    answer = jaxskills("evaluate", str(run), "--episodes", "64", "--style-clip", clip, "--json")
+    return json.loads(answer).get("gram_distance_mean") if answer else None
 
 
 if __name__ == "__main__":

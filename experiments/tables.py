@@ -13,6 +13,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from compare import COMPARISONS
+
 RESULTS = Path(__file__).parent / "results"
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks" / "results"
 BLOCK = re.compile(r"(<!-- tables\.py (\w+) -->\n).*?(<!-- end of tables\.py -->)", re.DOTALL)
@@ -36,7 +38,7 @@ _HEAD = (
 
 def records(folder: Path) -> list[dict[str, Any]]:
     """Returns the records of `reproduce.py`, by skill and seed."""
-    found = [json.loads(path.read_text()) for path in folder.glob("*.json")]
+    found = [json.loads(path.read_text()) for path in folder.glob("*-*.json")]
     return sorted(found, key=lambda record: (record["skill"], record["seed"]))
 
 
@@ -83,21 +85,27 @@ def comparison(cases: dict[str, dict[str, Any]]) -> str:
     """Returns the table of a comparison: one line for each label's record."""
     heads = ["case", "samples", "95 % first after", "minutes", "20 s without a fall", "mean time"]
     cells = [[label, *_measured(record)] for label, record in cases.items()]
-    for name, (head, form) in _STYLES.items():
-        if any(name in (record["evaluate"] or {}) for record in cases.values()):
-            heads.append(head)
-            for row, record in zip(cells, cases.values(), strict=True):
-                value = (record["evaluate"] or {}).get(name)
-                row.append("" if value is None else form.format(value))
+    columns = [_style(record) for record in cases.values()]
+    for head in {head: None for style in columns for head in style}:
+        heads.append(head)
+        for row, style in zip(cells, columns, strict=True):
+            row.append(style.get(head, ""))
     lines = [heads, ["---"] * len(heads), *cells]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-_STYLES = {
-    "energy_mean": ("energy, J", "{:.1f}"),
-    "volume_mean": ("hull volume, l", "{:.1f}"),
-    "gram_distance_mean": ("Gram distance", "{:.3g}"),
-}
+_MEASURES = (("energy_mean", "energy, J", 1.0), ("volume_mean", "hull volume, l", 1e3))
+
+
+def _style(record: dict[str, Any]) -> dict[str, str]:
+    """Returns the measures of style of a comparison of styles, by the heads of their columns."""
+    found, distances = record["evaluate"] or {}, record.get("gram_distances") or {}
+    cells = {f"distance from {clip}": f"{d:.2f}" for clip, d in distances.items() if d is not None}
+    if "--env.style.style" in record["command"] or "_style " in record["command"]:
+        for name, head, scale in _MEASURES:
+            if found.get(name) is not None:
+                cells[head] = f"{scale * found[name]:.1f}"
+    return cells
 
 
 def _measured(record: dict[str, Any]) -> list[str]:
@@ -119,11 +127,13 @@ def trainings() -> str:
 
 
 def comparisons() -> str:
-    """Returns a table for each folder of results, in order of the alphabet."""
+    """Returns a table for each comparison of which there are results."""
     tables = []
-    for folder in sorted(path for path in RESULTS.iterdir() if path.is_dir()):
-        cases = {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
-        tables.append(f"**{folder.name}**\n\n{comparison(cases)}")
+    for name, labels in COMPARISONS.items():
+        paths = {label: RESULTS / name / f"{label}.json" for label in labels}
+        cases = {k: json.loads(path.read_text()) for k, path in paths.items() if path.is_file()}
+        if cases:
+            tables.append(f"**{name}**\n\n{comparison(cases)}")
     return "\n\n".join(tables) or "None yet."
 
 

@@ -22,7 +22,13 @@ def script(name: str) -> ModuleType:
     return module
 
 
+@pytest.fixture(autouse=True)
+def scripts_see_each_other(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.syspath_prepend(ROOT / "experiments")
+
+
 RECORD = {
+    "command": "jaxskills train walk",
     "skill": "walk",
     "seed": 2,
     "samples": 1_234_000,
@@ -58,19 +64,22 @@ def test_the_readme_shows_the_records(readme: str):
 def test_a_comparison_table():
     curve = [{"samples": 1e6, "success_rate": 0.5}, {"samples": 2e6, "success_rate": 0.97}]
     found = {"success_rate": 0.984375, "episodes": 64, "seconds_mean": 19.5}
+    style = {"command": "jaxskills train run_style --samples 1", "curve": curve}
+    measured = found | {"energy_mean": 61.23, "volume_mean": 0.0512}
     cases = {
-        "with": RECORD | {"curve": curve, "evaluate": found | {"energy_mean": 61.23}},
-        "without": RECORD | {"curve": curve[:1], "evaluate": found},
+        "plain": RECORD | {"curve": curve[:1], "evaluate": measured},
+        "like": RECORD | style | {"evaluate": measured, "gram_distances": {"happy_walk": 0.876}},
     }
     lines = script("tables").comparison(cases).splitlines()
-    assert lines[0].endswith("| mean time | energy, J |")
-    assert lines[2] == "| with | 1.23 M | 2.00 M | 2 | 98% of 64 | 19.5 s | 61.2 |"
-    assert lines[3] == "| without | 1.23 M | never | 2 | 98% of 64 | 19.5 s |  |"
+    assert lines[0].endswith(
+        "| mean time | distance from happy_walk | energy, J | hull volume, l |"
+    )
+    assert lines[2] == "| plain | 1.23 M | never | 2 | 98% of 64 | 19.5 s |  |  |  |"
+    assert lines[3] == "| like | 1.23 M | 2.00 M | 2 | 98% of 64 | 19.5 s | 0.88 | 61.2 | 51.2 |"
 
 
-def test_each_comparison_can_be_trained(monkeypatch: pytest.MonkeyPatch):
+def test_each_comparison_can_be_trained():
     """Its skills are recipes, and its options are options of `train`."""
-    monkeypatch.syspath_prepend(ROOT / "experiments")
     for name, cases in script("compare").COMPARISONS.items():
         for label, case in cases.items():
             command = ["train", case.skill, "--out", "nowhere", *case.options]
