@@ -95,15 +95,16 @@ COMPARISONS: dict[str, dict[str, Case]] = {
         "loose": Case("walk", _of(f"--samples 4000000 {_LOOSE} --bounds.end-effectors 1")),
     },
     "cartwheel_bounds": {
-        "tight": Case("cartwheel", _of(f"--samples 12000000 {_TIGHT} --bounds.end-effectors 0.25")),
-        "default": Case("cartwheel", _of("--samples 12000000")),
-        "loose": Case("cartwheel", _of(f"--samples 12000000 {_LOOSE} --bounds.end-effectors 1")),
+        "tight": Case("cartwheel", _of(f"--samples 6000000 {_TIGHT} --bounds.end-effectors 0.25")),
+        "default": Case("cartwheel", _of("--samples 6000000")),
+        "loose": Case("cartwheel", _of(f"--samples 6000000 {_LOOSE} --bounds.end-effectors 1")),
     },
     "sparse_jog": _poor("sparse_jog", 3_000_000),
-    "cartwheel_styles": _styles("cartwheel_style", 8_000_000),
-    "dance_styles": _styles("dance_style", 6_000_000),
+    "sparse_high_knees": _poor("sparse_high_knees", 3_000_000),
+    "cartwheel_styles": _styles("cartwheel_style", 4_000_000),
+    "dance_styles": _styles("dance_style", 4_000_000),
     "run_styles": _transfers("run_style", ("happy_walk", "bent_walk"), 4_000_000),
-    "cartwheel_blend": _blends("cartwheel", "energy_down", 8_000_000),
+    "cartwheel_blend": _blends("cartwheel", "energy_down", 4_000_000),
 }
 
 

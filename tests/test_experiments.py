@@ -88,6 +88,14 @@ def test_each_comparison_can_be_trained():
             trainer.validate(config)
 
 
+def test_deepmimic_is_imitation_until_a_fall_without_anything_of_ours():
+    case = script("compare").COMPARISONS["sparse_jog"]["deepmimic"]
+    _, config = cli.parse(["train", case.skill, "--out", "nowhere", *case.options])
+    env = config.env
+    assert (env.reward, env.stop, env.feedforward) == ("imitation", "fall", False)
+    assert config.starts.uniform == 1.0 and not config.evolution.enabled
+
+
 @pytest.mark.parametrize("count", [1, 39, 40, 1000])
 def test_a_thinned_curve_keeps_its_ends_and_its_evaluations(count: int):
     rows = [{"samples": i} | ({"success_rate": 0.5} if i == 7 else {}) for i in range(count)]
