@@ -21,7 +21,7 @@ from jaxskills.plot import starts
 METRICS = [
     {"samples": 1e6, "wall_s": 60.0, "survival_s": 0.5, "ended/com_z": 0.75, "ended/root": 0.25},
     {"samples": 2e6, "wall_s": 120.0, "survival_s": 2.0, "ended/com_z": 1.0, "seconds_mean": 5.0},
-    {"samples": 4e6, "wall_s": 300.0, "survival_s": 6.0, "ended/time limit": 1.0},
+    {"samples": 4e6, "wall_s": 300.0, "survival_s": 6.0, "ended/neck": 1.0},
 ]
 
 
@@ -59,9 +59,14 @@ def test_learning_curve_with_adaptive_bounds(axes):
     assert right.get_ylabel() == "scale of the bounds" and right.get_ylim()[0] == 0
 
 
+def test_a_run_without_failures_does_not_flatten_the_learning_curve(axes):
+    plot.learning_curve([*METRICS, {"samples": 5e6, "wall_s": 400.0, "survival_s": 341.0}], axes)
+    assert axes.get_ylim() == (0.0, 25.0)
+
+
 def test_causes_stack_to_the_whole(axes):
     plot.causes(METRICS, axes)
-    assert _texts(axes) == ["root", "time limit", "com_z"]  # the largest at the bottom
+    assert _texts(axes) == ["root", "neck", "com_z"]  # the largest at the bottom
     tops = [band.get_paths()[0].vertices for band in axes.collections]
     assert max(top[:, 1].max() for top in tops) == pytest.approx(100.0)
     bottom = tops[0]
@@ -155,7 +160,7 @@ def test_regions_show_least_mean_and_largest_of_every_bound():
 def test_training_endings_are_summed_over_the_lines(axes):
     rows = [dict(line) for line in METRICS]
     rows[0]["endings"] = {"com_z": [1, 0, 2], "root": [0, 0, 1]}
-    rows[2]["endings"] = {"com_z": [1, 0, 0], "time limit": [7, 7, 7]}
+    rows[2]["endings"] = {"com_z": [1, 0, 0], "neck": [0, 0, 0]}
     plot.training_endings(rows, axes)
     assert np.array_equal(np.asarray(axes.images[0].get_array()), [[2, 0, 2], [0, 0, 1]])
     assert [label.get_text() for label in axes.get_yticklabels()] == ["com_z (4)", "root (1)"]

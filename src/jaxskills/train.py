@@ -175,7 +175,11 @@ class _Judge:
 def line(
     made: Trainer, metrics: list[dict[str, np.ndarray]], samples: int, wall: float
 ) -> dict[str, Any]:
-    """Returns one line of metrics.jsonl: sums and means over a few updates."""
+    """Returns one line of metrics.jsonl: sums and means over a few updates.
+
+    `survival_s` is the mean time between failures, which does not depend on when episodes are cut
+    off. Without a failure it is the time that was simulated.
+    """
     total = {name: sum(m[name] for m in metrics) for name in metrics[0]}
     count = len(metrics)
     endings = np.asarray(total["endings"])
@@ -192,7 +196,7 @@ def line(
     return {
         "samples": samples,
         "wall_s": round(wall, 2),
-        "survival_s": float(total["steps"] / max(total["episodes"], 1.0) * CONTROL_DT),
+        "survival_s": float(total["steps"] / max(total["failures"], 1.0) * CONTROL_DT),
         "reward": float(total["reward"] / count),
         "kl": float(total["kl"] / count),
         "clipped": float(total["clipped"] / count),

@@ -174,6 +174,7 @@ def make(config: TrainConfig) -> Trainer:
             adaptive_lib.under(state.adaptive, begin(state.starts, state.elites, start_key)),
             act_key,
             config.horizon,
+            CONTROL_DT / config.starts.renewal,
         )
         batch = to_batch(config.ppo, nets, state.learner, state.normalizer, steps)
         learner, metrics = ppo_lib.update(config.ppo, nets, state.learner, batch, learn_key)
@@ -267,16 +268,16 @@ def within_cycle(env: core.Environment, phase: jax.Array) -> jax.Array:
 def episode_metrics(env: core.Environment, steps: rollout.Transition) -> dict[str, jax.Array]:
     """Returns counts of an update, to be summed over updates by whoever shows them.
 
-    `steps` and `episodes` give the mean survival; `endings [E, PHASE_BINS]` says what ended
-    episodes at which phase.
+    `steps` and `failures` give the mean time to a failure; `endings [E, PHASE_BINS]` says what
+    they were and at which phase. An episode that was cut off is none.
     """
-    ended = steps.terminated | steps.truncated
+    ended = steps.terminated
     place = jnp.floor(within_cycle(env, steps.phase) / env.length * PHASE_BINS).astype(jnp.int32)
     by_cause = jax.nn.one_hot(steps.ended_by, len(env.endings)) * ended[..., None]
     by_phase = jax.nn.one_hot(jnp.clip(place, 0, PHASE_BINS - 1), PHASE_BINS)
     return {
         "steps": jnp.float32(ended.size),
-        "episodes": jnp.sum(ended, dtype=jnp.float32),
+        "failures": jnp.sum(ended, dtype=jnp.float32),
         "diverged": jnp.sum(by_cause[..., env.endings.index("diverged")]),
         "endings": jnp.einsum("tbe,tbp->ep", by_cause, by_phase),
         "reward": jnp.mean(steps.spike + steps.rate),

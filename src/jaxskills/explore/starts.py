@@ -17,6 +17,9 @@ class StartsConfig:
     segments: int = 10
     uniform: float = 0.2  # u of SB eq. 11, the share that stays uniform
     memory: float = 0.9  # of the running average of a segment's return, for each start seen there
+    # s after which an episode is cut off for a new start, in the mean; inf: never. Otherwise, once
+    # most episodes last, those that fail at once have next to no share in what is learnt from.
+    renewal: float = 5.0
 
 
 @struct.dataclass
@@ -103,6 +106,8 @@ def validate(config: StartsConfig) -> None:
     """
     if config.segments < 1:
         raise UserError(f"starts.segments is {config.segments}: give 1 or more")
+    if not config.renewal > 0:
+        raise UserError(f"starts.renewal is {config.renewal}: give a positive number of s, or inf")
     for name in ("uniform", "memory"):
         if not 0 <= getattr(config, name) <= 1:
             raise UserError(f"starts.{name} is {getattr(config, name)}: give 0 to 1")

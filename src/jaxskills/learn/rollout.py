@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rollouts: B environments step together and begin anew where they end."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -61,27 +62,34 @@ def collect(
     fresh: Fresh,
     key: jax.Array,
     horizon: int,
+    renewal: float = 0.0,
 ) -> tuple[Fresh, Transition]:
     """Returns the environments after `horizon` steps and all transitions on the way.
 
-    An environment whose episode ends goes on from a random row of `fresh`. The key is consumed.
+    An environment whose episode ends goes on from a random row of `fresh`, and so does one whose
+    episode is cut off, with chance `renewal` in each step. The key is consumed.
     """
     count = current.obs.shape[0]
-    noise_key, row_key = jax.random.split(key)
+    noise_key, row_key, cut_key = jax.random.split(key, 3)
     noise = networks.noise * jax.random.normal(noise_key, (horizon, count, env.action_size))
     rows = jax.random.randint(row_key, (horizon, count), 0, count)
+    cuts = jax.random.bernoulli(cut_key, renewal, (horizon, count))
 
-    def advance(now: Fresh, drawn: tuple[jax.Array, jax.Array]) -> tuple[Fresh, Transition]:
-        noise, row = drawn
+    def advance(
+        now: Fresh, drawn: tuple[jax.Array, jax.Array, jax.Array]
+    ) -> tuple[Fresh, Transition]:
+        noise, row, cut = drawn
         mean = networks.mean(policy, normalize.apply(normalizer, now.obs))
         action = mean + noise
         state, outcome = jax.vmap(env.step)(now.state, action)
+        truncated = outcome.truncated | (cut & ~outcome.terminated)
+        outcome = dataclasses.replace(outcome, truncated=truncated)
         transition = _transition(now, outcome, action, log_prob(action, mean, networks.noise))
         ended = outcome.terminated | outcome.truncated
         following = Fresh(state, outcome.obs)
         return _where(ended, jax.tree.map(lambda x: x[row], fresh), following), transition
 
-    return jax.lax.scan(advance, current, (noise, rows))
+    return jax.lax.scan(advance, current, (noise, rows, cuts))
 
 
 def _transition(now: Fresh, outcome: Outcome, action: jax.Array, chance: jax.Array) -> Transition:

@@ -23,6 +23,7 @@ from jaxskills.plot.sheet import (
     say,
 )
 
+_LONGEST = 25.0  # s, for what lasts longer than the 20 s of a test is learnt
 _REQUIRED = ("samples", "wall_s", "survival_s")
 
 
@@ -46,7 +47,7 @@ def learning_curve(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
         if seen.any():
             axes.plot(samples[seen], values[seen], "o-", color=colour, ms=3, lw=1, label=label)
     axes.set_xlim(left=0.0)
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, min(axes.get_ylim()[1], _LONGEST))
     scale = _column(metrics, "bound_scale")
     if np.isfinite(scale).any():
         right = axes.twinx()
@@ -57,7 +58,7 @@ def learning_curve(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
         right.spines[["top", "left"]].set_visible(False)
     last = metrics[-1]
     told = f"Learning curve: {last['samples'] / 1e6:.3g} million samples, {_duration(last)}"
-    finish(axes, told, "samples (millions)", "mean length of an episode (s)")
+    finish(axes, told, "samples (millions)", "mean time to a failure (s)")
     axes.legend(fontsize=8, frameon=False)
 
 
@@ -85,9 +86,7 @@ def causes(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
 
 
 def training_endings(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
-    """Draws where in the cycle training episodes ended, all lines together, and by which bound.
-
-    Episodes that lasted to their time limit are not counted.
+    """Draws where in the cycle training episodes failed, all lines together, and by which bound.
 
     Raises:
       UserError: see `learning_curve`.
@@ -100,7 +99,7 @@ def training_endings(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
         say(axes, "not recorded")
         return
     total: dict[str, np.ndarray] = {}
-    for name in {name: None for line in recorded for name in line if name != "time limit"}:
+    for name in {name: None for line in recorded for name in line}:
         total[name] = np.sum([line[name] for line in recorded if name in line], axis=0)
     states.endings(total, axes, told="Where {} training episodes ended")
 
