@@ -90,7 +90,7 @@ def environment(probe: Probe) -> Environment:
         outcome = Outcome(observe(state), rate, spike, dphase, terminated, truncated, report)
         return state, outcome
 
-    return Environment(start, None, observe, step, 1, ("diverged",), 2.0)  # pyright: ignore
+    return Environment(start, None, observe, step, 1, ("diverged",), 2.0, 2.0)  # pyright: ignore
 
 
 class Learnt(NamedTuple):

@@ -81,7 +81,7 @@ def digest(folder: Path) -> str:
         (("evaluate", "run", "--backend", "gpu"), "('auto', 'cpu', 'mjx', 'warp')"),
         (("train",), "Missing from jaxskills train: SKILL"),
         (("train", "walk"), "Missing from jaxskills train: --out RUN"),
-        (("train", "wlak", "--out", "run"), "unknown skill 'wlak': choose one of run, walk, "),
+        (("train", "wlak", "--out", "run"), "unknown skill 'wlak': choose one of atlas_jump, "),
         (("train", "walk", "--out", "run", "--backend", "gpu"), "('auto', 'cpu', 'mjx', 'warp')"),
         (("train", "walk", "--out", "run", "--samples", "many"), "--samples: invalid literal"),
         (("train", "walk", "--out", "run", "--ppo.rate", "1"), "--ppo.rate"),

@@ -20,13 +20,15 @@ def nets() -> Networks:
 
 
 def _collect(
-    nets: Networks, probe: probes.Probe, key: jax.Array
+    nets: Networks, probe: probes.Probe, key: jax.Array, renewal: float = 0.0
 ) -> tuple[rollout.Fresh, Transition]:
     """Returns a rollout that begins on side -1; all fresh starts are on side 1."""
     env = probes.environment(probe)
     policy, _ = nets.init(jax.random.key(0))
     current, fresh = (rollout.begin(env, jnp.full(ENVS, phase)) for phase in (0.25, 1.5))
-    return rollout.collect(env, nets, policy, normalize.init(1), current, fresh, key, HORIZON)
+    return rollout.collect(
+        env, nets, policy, normalize.init(1), current, fresh, key, HORIZON, renewal
+    )
 
 
 @pytest.mark.parametrize("probe", [probes.STRETCHED, probes.CUT_OFF])
@@ -44,6 +46,20 @@ def test_rows_follow_one_another_until_an_episode_ends(nets: Networks, probe: pr
     np.testing.assert_allclose(phase[1:], np.where(ended, 1.5, goes_on), atol=1e-6)
     obs = np.concatenate((steps.obs, np.asarray(last.obs)[None]))
     np.testing.assert_array_equal(obs[1:][~ended], np.asarray(steps.next_obs)[~ended])
+
+
+def test_episodes_are_cut_off_for_new_starts(nets: Networks):
+    """An endless probe goes on from a fresh start after a cut, and termination goes first."""
+    endless = probes.CUT_OFF._replace(steps=1000)
+    last, steps = _collect(nets, endless, jax.random.key(1), renewal=0.3)
+    cut = np.asarray(steps.truncated)
+    assert not np.asarray(steps.terminated).any()
+    assert 0.3 * cut.size - 4 * np.sqrt(0.21 * cut.size) < cut.sum() < 0.3 * cut.size * 2
+    following = np.concatenate((steps.phase, np.asarray(last.state.phase)[None]))[1:]
+    np.testing.assert_array_equal(cut, following == 1.5)
+    _, steps = _collect(nets, probes.DELAYED, jax.random.key(1), renewal=1.0)
+    assert not (np.asarray(steps.truncated) & np.asarray(steps.terminated)).any()
+    assert (np.asarray(steps.truncated) | np.asarray(steps.terminated)).all()
 
 
 def test_what_is_seen_last_is_of_the_old_episode(nets: Networks):
