@@ -27,7 +27,7 @@ physics.mjx physics.servo physics
 env.observe env.bounds env.bounds_file env.rewards env.style env.gram env.core env
 learn.networks learn.normalize learn.windows learn.autoencoder learn.gae learn.ppo learn.rollout
 learn
-explore.starts explore.evolution explore.adaptive explore
+explore.starts explore.evolution explore.adaptive explore.refine explore
 
 trainer checkpoint evaluate style_measures train
 render.opengl render.stage render.take render.video render.strip render

@@ -64,12 +64,15 @@ def line(name: str, total: int, metrics: Mapping[str, Any], pace: float) -> str:
     """Returns `walk  1.2M of 20M samples (6%)  survival 3.1 s  25k/s  12:33 left`.
 
     `pace` in samples per second; see `live` for the others. With `worst_bound` and `worst_phase` it
-    also says what ends most episodes, and where; with `bound_scale` how wide adaptive bounds are.
+    also says what ends most episodes, and where; with `bound_scale` how wide adaptive bounds are;
+    with `fine` that physics steps are finer now.
     """
     samples = metrics["samples"]
     ends = ""
     if "worst_bound" in metrics:
         ends = f"  ends by {metrics['worst_bound']} at {metrics['worst_phase']:.0%} of a cycle"
+    if metrics.get("fine"):
+        ends += "  fine physics"
     if "bound_scale" in metrics:
         ends += f"  bounds x{metrics['bound_scale']:.2f}"
     left = _clock((total - samples) / pace) if pace > 0 else "?"

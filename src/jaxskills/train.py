@@ -65,7 +65,8 @@ def train(
     if resume:
         state = checkpoint.restore(run, made)
         history = _rewind(run, int(state.samples))
-        update = jit(made.update, donate=True)
+        now = trainer.refined(made) if state.refinement.fine else made
+        update = jit(now.update, donate=True)
     else:
         _claim(run)
         init, update = _compile(made)
@@ -98,7 +99,7 @@ def _loop(
     config = made.config
     judge = _Judge(made)
     before = history[-1]["wall_s"] if history else 0.0
-    saved = time.monotonic()
+    saved, fine = time.monotonic(), bool(state.refinement.fine)
     samples, sums, why = int(state.samples), [], ""
     last: dict[str, Any] = {"samples": samples, "wall_s": before}
     if history:
@@ -113,6 +114,8 @@ def _loop(
                 state, metrics = update(state)
                 samples += config.envs * config.horizon
                 sums.append(jax.device_get(metrics))
+                if sums[-1]["fine"] and not fine:
+                    update, fine = jit(trainer.refined(made).update, donate=True), True
             first = "survival_s" not in last
             if sums and (len(sums) == _LOG_UPDATES or why or first):
                 last = line(made, sums, samples, before + time.monotonic() - begin)
@@ -203,6 +206,7 @@ def line(
         "value_loss": float(total["value_loss"] / count),
         "policy_lr": float(total["policy_lr"] / count),
         "diverged": int(total["diverged"]),
+        **({"fine": True} if metrics[-1]["fine"] else {}),
         **({"bound_scale": float(metrics[-1]["bound_scale"])} if "bound_scale" in total else {}),
         **ended,
     }

@@ -26,6 +26,7 @@ from jaxskills.env import core, gram
 from jaxskills.errors import UserError
 from jaxskills.explore import adaptive as adaptive_lib
 from jaxskills.explore import evolution as evolution_lib
+from jaxskills.explore import refine as refine_lib
 from jaxskills.explore import starts as starts_lib
 from jaxskills.learn import autoencoder, gae, normalize, rollout
 from jaxskills.learn import networks as networks_lib
@@ -53,6 +54,7 @@ class TrainConfig:
     motion: motion_lib.MotionConfig = motion_lib.MotionConfig()
     starts: starts_lib.StartsConfig = starts_lib.StartsConfig()
     evolution: evolution_lib.EvolutionConfig = evolution_lib.EvolutionConfig()
+    refine: refine_lib.RefineConfig = refine_lib.RefineConfig()
     networks: networks_lib.NetworkConfig = networks_lib.NetworkConfig()
     ppo: ppo_lib.PPOConfig = ppo_lib.PPOConfig()
 
@@ -69,6 +71,7 @@ class TrainState:
     key: jax.Array  # root of all randomness; the number of updates is folded in
     updates: jax.Array  # [] int32
     samples: jax.Array  # [] uint32, transitions learnt from
+    refinement: refine_lib.Refinement  # where it is fine, `refined` says how the next update goes
     adaptive: adaptive_lib.Adaptive | None = None  # None: the bounds stay as they are
 
 
@@ -160,7 +163,8 @@ def make(config: TrainConfig) -> Trainer:
         normalizer = normalize.update(normalize.init(obs_size), current.obs)
         learner = ppo_lib.init(config.ppo, nets, learner_key)
         counts = jnp.int32(0), jnp.uint32(0)
-        return TrainState(learner, normalizer, starts, elites, current, key, *counts, adaptive)
+        more = refine_lib.init(), adaptive
+        return TrainState(learner, normalizer, starts, elites, current, key, *counts, *more)
 
     def update(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(state.key, state.updates)
@@ -194,11 +198,12 @@ def make(config: TrainConfig) -> Trainer:
                 config.evolution, elites, visited, evolve_key, motion.length
             )
         metrics |= episode_metrics(env, steps)
+        failures, seconds = metrics["failures"], config.envs * config.horizon * CONTROL_DT
+        refinement = refine_lib.update(config.refine, state.refinement, failures, seconds)
+        metrics["fine"] = refinement.fine
         adaptive = state.adaptive
         if adaptive is not None:
             metrics["bound_scale"] = adaptive.scale
-            failures = jnp.sum(steps.terminated, dtype=jnp.float32)
-            seconds = config.envs * config.horizon * CONTROL_DT
             adaptive = adaptive_lib.update(config.adaptive_bounds, adaptive, failures, seconds)
         new_state = TrainState(
             learner,
@@ -209,11 +214,22 @@ def make(config: TrainConfig) -> Trainer:
             state.key,
             state.updates + 1,
             state.samples + jnp.uint32(config.envs * config.horizon),
+            refinement,
             adaptive,
         )
         return new_state, metrics
 
     return Trainer(config, character, motion, env, nets, init, update)
+
+
+def refined(made: Trainer) -> Trainer:
+    """Returns the same trainer with finer physics steps, for states whose refinement is fine.
+
+    Its `update` is another program, which takes and gives the same kind of state.
+    """
+    env = made.config.env
+    finer = dataclasses.replace(env, substeps=env.substeps * made.config.refine.factor)
+    return make(dataclasses.replace(made.config, env=finer))
 
 
 def to_batch(
@@ -299,6 +315,7 @@ def validate(config: TrainConfig) -> None:
     starts_lib.validate(config.starts)
     evolution_lib.validate(config.evolution)
     adaptive_lib.validate(config.adaptive_bounds)
+    refine_lib.validate(config.refine)
     if config.adaptive_bounds.enabled and config.env.stop != "bounds":
         raise UserError(
             f"env.stop is {config.env.stop}: adaptive_bounds need bounds, which end the episodes"
