@@ -118,6 +118,7 @@ def style(config: TrainConfig, character: Character, motion: Motion, clip: str) 
       UserError: a broken clip, or an autoencoder that is missing or of other bodies.
     """
     wanted = config.env.style
+    clip_lib.find(clip)  # a mistake in its name is said first
     model = autoencoder.load(wanted.autoencoder or autoencoder.shipped(), character)
     shown = reference(dataclasses.replace(config, clip=clip), character)
     encode = functools.partial(autoencoder.style, model)
