@@ -237,6 +237,17 @@ def test_a_skill_that_stands_on_coarse_physics_alone_is_not_learnt(
     assert judge.learnt
 
 
+def test_evaluations_wait_unless_survival_has_doubled(
+    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+):
+    found = {"success_rate": 0.25}
+    monkeypatch.setattr(train._Judge, "_evaluate", lambda *_: (found, 60.0))  # a costly minute
+    judge = train._Judge(trainer.make(dataclasses.replace(config, stop_when_learnt=True)))
+    state: Any = None
+    asked = [bool(judge(state, survival)) for survival in (2.5, 2.5, 4.9, 5.0, 5.0, 9.9, 10.0)]
+    assert asked == [True, False, False, True, False, False, True]
+
+
 @pytest.mark.timeout(300)
 def test_a_skill_that_stands_is_learnt_and_the_run_ends(config: TrainConfig, tmp_path: Path):
     walk = clip.load(config.clip)

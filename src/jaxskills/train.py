@@ -29,7 +29,7 @@ SAVE_SECONDS = 120.0  # between checkpoints
 _LOG_UPDATES = 5  # between lines of metrics.jsonl
 # Evaluations' share of the time, at most. The fine one runs only near the end and costs four times
 # as much: at the same share it would put off the next one, and so the end, by minutes. While most
-# episodes still fall the end is far, and evaluations are few.
+# episodes still fall the end is far, and evaluations are few, unless survival has doubled since.
 _EARLY_SHARE = 0.05
 _EVALUATION_SHARE = 0.2
 _FINE_SHARE = 0.5
@@ -147,11 +147,14 @@ class _Judge:
         self._compiled: dict[int | None, Any] = {}  # by substeps
         self._seed = 0
         self._due = 0.0
+        self._tried = 0.0  # survival at the last evaluation
 
     def __call__(self, state: TrainState, survival: float) -> dict[str, float]:
         enabled = self._made.config.stop_when_learnt
-        if time.monotonic() < self._due or survival < _PROMISING_SECONDS or not enabled:
+        early = time.monotonic() < self._due and survival < 2.0 * self._tried
+        if early or survival < _PROMISING_SECONDS or not enabled:
             return {}
+        self._tried = survival
         found, spent = self._evaluate(state, None)
         pause = spent / (_EARLY_SHARE if found["success_rate"] < 0.5 else _EVALUATION_SHARE)
         if found["success_rate"] >= _SURE_RATE:
