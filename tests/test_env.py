@@ -90,6 +90,13 @@ def faller(who: Character) -> Running:
 
 
 @pytest.fixture(scope="module")
+def roller(who: Character) -> Running:
+    """A frozen stand in which every body may touch the ground."""
+    config = EnvConfig(stop="fall", may_touch=("pelvis", "torso", "left_leg", "right_leg"))
+    return _running(_frozen(who, tiny.standing(), True, config))
+
+
+@pytest.fixture(scope="module")
 def once(who: Character) -> Running:
     """A frozen motion of a second without loop: in the floor, on it, above it, on tilted legs."""
     qpos = tiny.standing(31)
@@ -268,6 +275,17 @@ def test_in_fall_mode_only_a_fall_ends_an_episode(
     assert bool(outcome.report.fallen) == fallen
     if fallen:
         assert faller.env.endings[int(outcome.report.ended_by)] == "fall"
+
+
+@pytest.mark.parametrize(
+    ("moved", "lost"),
+    [({}, False), ({"d2": -0.1}, False), ({"d0": 5.0}, True), ({"d9": 2.0}, True)],
+)
+def test_who_may_lie_on_the_ground_falls_by_leaving_the_bounds(
+    who: Character, roller: Running, moved: dict, lost: bool
+):
+    _, outcome = roller.step(_put(_displaced(who, **moved)), STILL)
+    assert bool(outcome.report.fallen) == bool(outcome.terminated) == lost
 
 
 def test_the_time_limit_cuts_off_and_does_not_terminate(

@@ -2,7 +2,8 @@
 """Evaluation: does the skill stand, for how long, and how close to the reference.
 
 As in SB Table 1, bounds do not end an evaluated episode: a fall does, that is any body on the floor
-that the character may not stand on. Actions are the policy's mean, starts are random phases. An
+that the character may not stand on. A skill with all bodies on the floor, like a roll, cannot fall:
+there leaving the bounds counts as one. Actions are the policy's mean, starts are random phases. An
 episode of a motion that does not loop is over soon after its end, and cannot fall any more. Bounds
 have the sizes of the configuration, adaptive ones too, so that runs can be compared.
 """

@@ -250,10 +250,11 @@ def make(
         sizes = bounds_lib.sizes(bounds, within / motion.length)
         sizes = sizes if state.scale is None else state.scale * sizes
         clear = ground.clearance(shapes, seen.bodies)
-        fallen = jnp.any(clear[no_touch] <= 0.0)
         touching = jnp.any(clear[forbidden] <= 0.0)
         diverged = sim.diverged | ~jnp.all(jnp.isfinite(errors))
         inside = jnp.all(errors <= sizes) & ~touching & ~diverged
+        # Who may lie on the ground cannot fall: then leaving the bounds is what loses the skill.
+        fallen = jnp.any(clear[no_touch] <= 0.0) if len(no_touch) else ~inside
         terminated = fallen | diverged if config.stop == "fall" else ~inside
         truncated = (state.step >= max_steps) | (state.phase >= end)
         worst = jnp.argmax(errors / sizes).astype(jnp.int32)
