@@ -78,12 +78,12 @@ def _blends(skill: str, style: str, samples: int) -> dict[str, Case]:
 
 COMPARISONS: dict[str, dict[str, Case]] = {
     "backflip_starts": {
-        "importance": Case("backflip", _of("--samples 20000000")),
-        "uniform": Case("backflip", _of("--samples 20000000 --starts.uniform 1")),
+        "importance": Case("backflip", _of("--samples 6000000")),
+        "uniform": Case("backflip", _of("--samples 6000000 --starts.uniform 1")),
     },
     "break_dance_evolution": {
-        "on": Case("break_dance", _of("--samples 6000000")),
-        "off": Case("break_dance", _of("--samples 6000000 --evolution.no-enabled")),
+        "on": Case("break_dance", _of("--samples 4000000")),
+        "off": Case("break_dance", _of("--samples 4000000 --evolution.no-enabled")),
     },
     "feedforward": {
         "with": Case("walk", _of("--samples 4000000")),
@@ -95,16 +95,16 @@ COMPARISONS: dict[str, dict[str, Case]] = {
         "loose": Case("walk", _of(f"--samples 4000000 {_LOOSE} --bounds.end-effectors 1")),
     },
     "cartwheel_bounds": {
-        "tight": Case("cartwheel", _of(f"--samples 6000000 {_TIGHT} --bounds.end-effectors 0.25")),
-        "default": Case("cartwheel", _of("--samples 6000000")),
-        "loose": Case("cartwheel", _of(f"--samples 6000000 {_LOOSE} --bounds.end-effectors 1")),
+        "tight": Case("cartwheel", _of(f"--samples 4000000 {_TIGHT} --bounds.end-effectors 0.25")),
+        "default": Case("cartwheel", _of("--samples 4000000")),
+        "loose": Case("cartwheel", _of(f"--samples 4000000 {_LOOSE} --bounds.end-effectors 1")),
     },
-    "sparse_jog": _poor("sparse_jog", 3_000_000),
-    "sparse_high_knees": _poor("sparse_high_knees", 3_000_000),
-    "cartwheel_styles": _styles("cartwheel_style", 4_000_000),
-    "dance_styles": _styles("dance_style", 4_000_000),
-    "run_styles": _transfers("run_style", ("happy_walk", "bent_walk"), 4_000_000),
-    "cartwheel_blend": _blends("cartwheel", "energy_down", 4_000_000),
+    "sparse_jog": _poor("sparse_jog", 2_000_000),
+    "sparse_high_knees": _poor("sparse_high_knees", 2_000_000),
+    "cartwheel_styles": _styles("cartwheel_style", 2_500_000),
+    "dance_styles": _styles("dance_style", 3_500_000),
+    "run_styles": _transfers("run_style", ("happy_walk", "bent_walk"), 2_500_000),
+    "cartwheel_blend": _blends("cartwheel", "energy_down", 2_500_000),
 }
 
 
