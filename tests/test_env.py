@@ -16,7 +16,7 @@ import tiny
 from jaxskills import character, ground, kinematics, motion, pose
 from jaxskills.character import Character
 from jaxskills.compilation import jit
-from jaxskills.env import bounds, core
+from jaxskills.env import bounds, core, variants
 from jaxskills.env.bounds import BoundsConfig
 from jaxskills.env.core import EnvConfig, Environment, EnvState, Outcome
 from jaxskills.errors import UserError
@@ -71,7 +71,8 @@ def _frozen(
         step=lambda model, variant, state, ctrl: dataclasses.replace(state, engine=ctrl),
     )
     made = bounds.make(who, sizes)
-    return core.make(who, tiny.make_motion(who, qpos, loop), stopped, None, made, config)
+    only = variants.one(who, tiny.make_motion(who, qpos, loop), None)
+    return core.make(who, only, stopped, made, config)
 
 
 @pytest.fixture(scope="module")

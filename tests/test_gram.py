@@ -14,7 +14,7 @@ import tiny
 from jaxskills import kinematics, rotation
 from jaxskills.character import Character
 from jaxskills.compilation import jit
-from jaxskills.env import bounds, core, gram
+from jaxskills.env import bounds, core, gram, variants
 from jaxskills.env.bounds import BoundsConfig
 from jaxskills.env.core import EnvConfig
 from jaxskills.env.style import StyleConfig
@@ -231,7 +231,9 @@ def _env(who: Character, pulled: Motion, reference: Motion, wanted: gram.Style |
     config = EnvConfig(reward="survival" if wanted is None else "style", style=style)
     wide = BoundsConfig(com=(9.0, 9.0, 9.0), root=9.0, joints=9.0, end_effectors=9.0)
     sizes = bounds.make(who, wide)
-    return core.make(who, reference, _puppet(who, pulled), None, sizes, config, wanted)
+    return core.make(
+        who, variants.one(who, reference, None), _puppet(who, pulled), sizes, config, wanted
+    )
 
 
 def _rewards(who: Character, pulled: Motion, wanted: gram.Style) -> tuple[np.ndarray, float]:
@@ -316,4 +318,5 @@ def test_gram_needs_a_style_and_nothing_else_takes_one(who, walk, same):
     gram_config = EnvConfig(reward="style", style=StyleConfig(style="gram", style_clip="some"))
     for config, given in ((gram_config, None), (EnvConfig(), same)):
         with pytest.raises(UserError, match="only gram comes with a style"):
-            core.make(who, walk, _puppet(who, walk), None, sizes, config, given)
+            only = variants.one(who, walk, None)
+            core.make(who, only, _puppet(who, walk), sizes, config, given)

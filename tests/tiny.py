@@ -13,7 +13,7 @@ from jaxskills import character, clip, motion
 from jaxskills import physics as physics_lib
 from jaxskills.character import Character
 from jaxskills.clip import data as clip_data
-from jaxskills.env import bounds, core
+from jaxskills.env import bounds, core, variants
 from jaxskills.learn.networks import NetworkConfig
 from jaxskills.learn.ppo import PPOConfig
 from jaxskills.motion import Motion
@@ -129,7 +129,8 @@ def make_env(
     """Returns the environment of the walker on the cpu physics."""
     engine, model = make_physics(who, config.substeps)
     made = bounds.make(who, sizes or bounds.BoundsConfig())
-    return core.make(who, reference, engine, model, made, config)
+    only = variants.one(who, reference, model)
+    return core.make(who, only, engine, made, config)
 
 
 def train_config(folder: Path, **changes) -> TrainConfig:

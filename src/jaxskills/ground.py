@@ -6,12 +6,11 @@ same on every backend. The support of every primitive towards the floor has one 
 of an edge, a ball, a disc and an ellipsoid term.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from flax import struct
 
 from jaxskills import rotation
 from jaxskills.kinematics import Bodies
@@ -19,17 +18,17 @@ from jaxskills.kinematics import Bodies
 _TYPES = mujoco.mjtGeom
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@struct.dataclass
 class Shapes:
-    """Support numbers of the G geoms that can touch the floor, on the host."""
+    """Support numbers of the G geoms that can touch the floor. Arrays, so variants can stack."""
 
-    body: np.ndarray  # [G] index among the N bodies
-    pos: np.ndarray  # [G, 3] m, in the body
-    frame: np.ndarray  # [G, 3, 3] orientation in the body
-    edge: np.ndarray  # [G, 3] m, half lengths of a box
-    ball: np.ndarray  # [G] m, radius of a sphere
-    disc: np.ndarray  # [G] m, radius of a disc across local z
-    ellipsoid: np.ndarray  # [G, 3] m, half axes
+    pos: jax.Array  # [G, 3] m, in the body
+    frame: jax.Array  # [G, 3, 3] orientation in the body
+    edge: jax.Array  # [G, 3] m, half lengths of a box
+    ball: jax.Array  # [G] m, radius of a sphere
+    disc: jax.Array  # [G] m, radius of a disc across local z
+    ellipsoid: jax.Array  # [G, 3] m, half axes
+    body: tuple[int, ...] = struct.field(pytree_node=False)  # [G] index among the N bodies
 
 
 def shapes(model: mujoco.MjModel) -> Shapes:
@@ -49,21 +48,22 @@ def shapes(model: mujoco.MjModel) -> Shapes:
         else:
             # A box, or a mesh by its bounding box (half sizes around the geom frame).
             edge[i] = size
-    body = model.geom_bodyid[rows] - 1
+    body = tuple(int(i) for i in model.geom_bodyid[rows] - 1)
     frame = np.zeros((len(rows), 9))
     for i, g in enumerate(rows):
         mujoco.mju_quat2Mat(frame[i], model.geom_quat[g])
     frame = frame.reshape(-1, 3, 3)
-    return Shapes(body, model.geom_pos[rows], frame, edge, ball, disc, ellipsoid)
+    numbers = (model.geom_pos[rows], frame, edge, ball, disc, ellipsoid)
+    return Shapes(*(jnp.asarray(x, jnp.float32) for x in numbers), body=body)
 
 
 def geom_clearance(shapes: Shapes, bodies: Bodies) -> jax.Array:
     """Returns the height `[G]` in m of each geom's lowest point; below 0 it is in the floor."""
-    rot = bodies.rot[shapes.body]
-    to_array = lambda x: jnp.asarray(x, rot.dtype)  # noqa: E731
+    body = np.array(shapes.body, int)
+    rot = bodies.rot[body]
     # The vertical seen from a body or a geom is the last row of its rotation matrix.
-    center = bodies.pos[shapes.body, 2] + jnp.sum(rot[:, 2] * to_array(shapes.pos), -1)
-    up = rotation.turn_back(to_array(shapes.frame), rot[:, 2])
+    center = bodies.pos[body, 2] + jnp.sum(rot[:, 2] * shapes.pos, -1)
+    up = rotation.turn_back(shapes.frame, rot[:, 2])
     across = jnp.sqrt(jnp.maximum(up[:, 0] ** 2 + up[:, 1] ** 2, 0.0))
     support = jnp.sum(shapes.edge * jnp.abs(up), -1) + shapes.ball + shapes.disc * across
     support += jnp.sqrt(jnp.sum((shapes.ellipsoid * up) ** 2, -1))
@@ -74,7 +74,7 @@ def clearance(shapes: Shapes, bodies: Bodies) -> jax.Array:
     """Returns the height `[N]` in m of each body's lowest point, infinite without geoms."""
     count = bodies.pos.shape[0]
     heights = geom_clearance(shapes, bodies)
-    by_body = [np.flatnonzero(shapes.body == body) for body in range(count)]
+    by_body = [np.flatnonzero(np.array(shapes.body) == body) for body in range(count)]
     lowest = [jnp.min(heights[rows]) if len(rows) else jnp.inf for rows in by_body]
     return jnp.stack([jnp.asarray(value, heights.dtype) for value in lowest])
 

@@ -22,7 +22,7 @@ from jaxskills import physics as physics_lib
 from jaxskills import pose, retarget
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
-from jaxskills.env import core, gram
+from jaxskills.env import core, gram, variants
 from jaxskills.errors import UserError
 from jaxskills.explore import adaptive as adaptive_lib
 from jaxskills.explore import evolution as evolution_lib
@@ -106,7 +106,8 @@ def environment(
     bounds = bounds_lib.make(character, config.bounds)
     clip = config.env.style.style_clip
     wanted = None if clip is None else style(config, character, motion, clip)
-    return core.make(character, motion, engine, model, bounds, config.env, wanted)
+    only = variants.one(character, motion, model)
+    return core.make(character, only, engine, bounds, config.env, wanted)
 
 
 def style(config: TrainConfig, character: Character, motion: Motion, clip: str) -> gram.Style:

@@ -20,9 +20,10 @@ from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import gram, observe, rewards
 from jaxskills.env import style as style_lib
+from jaxskills.env.variants import Variant, Variants, pick
 from jaxskills.errors import UserError
 from jaxskills.kinematics import Bodies
-from jaxskills.motion import CONTROL_DT, Motion, sample
+from jaxskills.motion import CONTROL_DT, sample
 from jaxskills.physics import Physics, SimState, servo
 
 # How an episode may end besides leaving a named bound.
@@ -61,7 +62,7 @@ class EnvState:
     sim: SimState
     phase: jax.Array  # [] control frames since the start of the reference's first cycle
     step: jax.Array  # [] int32, control steps since the episode began
-    variant: jax.Array  # [] int32, which compiled model it runs
+    variant: jax.Array  # [] int32, which of the `Variants` it is
     scale: jax.Array | None = None  # [] that multiplies the sizes of the bounds; None: 1
     window: gram.Window | None = None  # the motion up to now, if the style is gram
 
@@ -95,8 +96,10 @@ class Outcome:
 class Environment(NamedTuple):
     """Pure functions of one environment, and their sizes."""
 
-    start: Callable[[jax.Array], EnvState]  # (phase []) -> a state on the reference there
-    place: Callable[[jax.Array, jax.Array, jax.Array], EnvState]  # (phase, qpos [nq], qvel [nv])
+    # (phase [], variant [] = 0) -> a state on the reference there
+    start: Callable[..., EnvState]
+    # (phase [], qpos [nq], qvel [nv], variant [] = 0) -> that state
+    place: Callable[..., EnvState]
     observe: Callable[[EnvState], jax.Array]  # (state) -> obs [O]
     step: Callable[[EnvState, jax.Array], tuple[EnvState, Outcome]]  # (state, action [A])
     action_size: int
@@ -117,20 +120,18 @@ class _Seen(NamedTuple):
 
 def make(
     character: Character,
-    motion: Motion,
+    variants: Variants,
     physics: Physics,
-    model: object,
     bounds: bounds_lib.Bounds,
     config: EnvConfig,
     wanted: gram.Style | None = None,
 ) -> Environment:
-    """Returns the environment of a character that follows `motion`.
+    """Returns the environment of a character that follows a reference.
 
     Args:
       character: who.
-      motion: the reference.
+      variants: the references, and what else environments differ by. The arrays may be traced.
       physics: the engine's functions; a step of them is one physics step.
-      model: what `physics.load` returned.
       bounds: sizes of the spacetime bounds.
       config: what an episode is.
       wanted: the style, if it is gram.
@@ -139,7 +140,6 @@ def make(
     if (wanted is None) == (config.style.style == "gram"):
         raise UserError(f"env.style.style is {config.style.style}: only gram comes with a style")
     layout, tree = character.layout, kinematics.tree(character.model)
-    params, shapes = kinematics.body_params(character.model), ground.shapes(character.model)
     servos, weights = servo.of(character), rewards.imitation_weights(character)
     effectors = tuple(character.body(name) for name in character.end_effectors)
     forward = character.forward / np.linalg.norm(character.forward)
@@ -152,18 +152,16 @@ def make(
     dofs = np.array(servos.dofs)
     neutral = jnp.asarray(character.model.qpos0, jnp.float32)
     max_steps = round(config.seconds / CONTROL_DT)
-    length = float(motion.length)
-    end = math.inf if motion.loop else length + _HOLD
+    length, loop = variants.length, variants.loop
+    end = math.inf if loop else length + _HOLD
     endings = (*bounds.names, *OTHER_ENDINGS)
 
-    def bodies_of(qpos: jax.Array, qvel: jax.Array) -> Bodies:
-        return kinematics.kinematics(tree, params, qpos, qvel)
-
     def look(state: EnvState) -> _Seen:
-        qpos, qvel = state.sim.qpos, state.sim.qvel
-        ref_qpos, ref_qvel = sample(layout, motion, state.phase)
+        own, qpos, qvel = pick(variants, state.variant), state.sim.qpos, state.sim.qvel
+        ref_qpos, ref_qvel = sample(layout, own.motion, state.phase)
         # Simulation and reference in one batch: half the code to compile.
-        pair = jax.vmap(bodies_of)(jnp.stack((qpos, ref_qpos)), jnp.stack((qvel, ref_qvel)))
+        both = jnp.stack((qpos, ref_qpos)), jnp.stack((qvel, ref_qvel))
+        pair = jax.vmap(lambda q, v: kinematics.kinematics(tree, own.body, q, v))(*both)
         bodies, reference = (jax.tree.map(lambda x: x[i], pair) for i in range(2))  # noqa: B023
         both = [bounds_lib.heading_effectors(b, effectors, axis) for b in (bodies, reference)]
         offset = pose.minus(layout, ref_qpos, qpos)
@@ -175,20 +173,26 @@ def make(
             seen.reference,
             seen.offset,
             state.phase,
-            motion.length,
+            jnp.float32(length),
             axis,
             seen.effectors[0],
         )
 
-    def start(phase: jax.Array) -> EnvState:
-        return place(phase, *sample(layout, motion, phase))
+    def start(phase: jax.Array, variant: jax.Array | int = 0) -> EnvState:
+        variant = jnp.asarray(variant, jnp.int32)
+        return place(phase, *sample(layout, pick(variants, variant).motion, phase), variant)
 
-    def place(phase: jax.Array, qpos: jax.Array, qvel: jax.Array) -> EnvState:
-        lowest = jnp.min(ground.clearance(shapes, bodies_of(qpos, qvel)))
+    def place(
+        phase: jax.Array, qpos: jax.Array, qvel: jax.Array, variant: jax.Array | int = 0
+    ) -> EnvState:
+        variant = jnp.asarray(variant, jnp.int32)
+        own = pick(variants, variant)
+        bodies = kinematics.kinematics(tree, own.body, qpos, qvel)
+        lowest = jnp.min(ground.clearance(own.shapes, bodies))
         qpos = qpos.at[2].add(jnp.maximum(_LIFT_MARGIN - lowest, 0.0))
-        sim = physics.init(model, jnp.int32(0), qpos, qvel)
+        sim = physics.init(variants.model, variant, qpos, qvel)
         window = None if wanted is None else gram.fill(wanted, phase)
-        return EnvState(sim, phase, jnp.int32(0), jnp.int32(0), window=window)
+        return EnvState(sim, phase, jnp.int32(0), variant, window=window)
 
     def observe_state(state: EnvState) -> jax.Array:
         return features(state, look(state))
@@ -196,13 +200,14 @@ def make(
     def advance(state: EnvState, action: jax.Array) -> tuple[SimState, jax.Array]:
         base, speed = neutral, jnp.zeros(layout.nv)
         if config.feedforward:
-            base, ahead = sample(layout, motion, state.phase + config.lead)
+            own = pick(variants, state.variant)
+            base, ahead = sample(layout, own.motion, state.phase + config.lead)
             speed = ahead if config.velocity_feedforward else speed
         target = pose.plus(layout, base, jnp.zeros(layout.nv).at[dofs].set(action))
 
         def substep(sim: SimState, _: None) -> tuple[SimState, jax.Array]:
             ctrl = servo.controls(servos, layout, sim.qpos, sim.qvel, target, speed)
-            return physics.step(model, state.variant, sim, ctrl), ctrl
+            return physics.step(variants.model, state.variant, sim, ctrl), ctrl
 
         sim, ctrl = jax.lax.scan(substep, state.sim, None, length=config.substeps)
         return sim, ctrl[-1]
@@ -217,39 +222,39 @@ def make(
             seen.reference,
         )
 
-    def style(seen: _Seen, before: SimState, after: EnvState) -> jax.Array:
-        earlier = bodies_of(before.qpos, before.qvel)
+    def style(own: Variant, seen: _Seen, before: SimState, after: EnvState) -> jax.Array:
+        earlier = kinematics.kinematics(tree, own.body, before.qpos, before.qvel)
         change = (after.sim.qvel - before.qvel) / CONTROL_DT
         joints = jnp.stack([jnp.linalg.norm(change[np.array(j.dofs)]) for j in layout.joints[1:]])
         likeness = None
         if wanted is not None and after.window is not None:
             likeness = gram.reward(wanted, after.window, config.style.gram)
-        return style_lib.reward(config.style, params, seen.bodies, earlier, joints, likeness)
+        return style_lib.reward(config.style, own.body, seen.bodies, earlier, joints, likeness)
 
-    def reward_of(seen: _Seen, before: SimState, after: EnvState) -> jax.Array:
+    def reward_of(own: Variant, seen: _Seen, before: SimState, after: EnvState) -> jax.Array:
         if config.reward == "imitation":
             return imitation(seen)
         if config.reward == "style":
-            return style(seen, before, after)
+            return style(own, seen, before, after)
         if config.reward == "blend":
             w = config.style_weight
-            return (1.0 - w) * imitation(seen) + w * style(seen, before, after)
+            return (1.0 - w) * imitation(seen) + w * style(own, seen, before, after)
         return jnp.float32(1.0)
 
     def step(state: EnvState, action: jax.Array) -> tuple[EnvState, Outcome]:
-        before = state.sim
+        before, own = state.sim, pick(variants, state.variant)
         sim, ctrl = advance(state, action)
         dphase = jnp.float32(1.0)
         state = dataclasses.replace(state, sim=sim, phase=state.phase + dphase, step=state.step + 1)
         seen = look(state)
         if wanted is not None and state.window is not None:
-            window = gram.push(wanted, state.window, params, seen.bodies)
+            window = gram.push(wanted, state.window, own.body, seen.bodies)
             state = dataclasses.replace(state, window=window)
         errors = bounds_lib.errors(layout, seen.offset, seen.bodies, seen.reference, seen.effectors)
-        within = state.phase % motion.length if motion.loop else state.phase
-        sizes = bounds_lib.sizes(bounds, within / motion.length)
+        within = state.phase % length if loop else state.phase
+        sizes = bounds_lib.sizes(bounds, within / length)
         sizes = sizes if state.scale is None else state.scale * sizes
-        clear = ground.clearance(shapes, seen.bodies)
+        clear = ground.clearance(own.shapes, seen.bodies)
         touching = jnp.any(clear[forbidden] <= 0.0)
         diverged = sim.diverged | ~jnp.all(jnp.isfinite(errors))
         inside = jnp.all(errors <= sizes) & ~touching & ~diverged
@@ -274,7 +279,7 @@ def make(
         outcome = Outcome(
             obs=features(state, seen),
             rate=jnp.float32(0.0),
-            spike=jnp.where(terminated, 0.0, reward_of(seen, before, state)),
+            spike=jnp.where(terminated, 0.0, reward_of(own, seen, before, state)),
             dphase=dphase,
             terminated=terminated,
             truncated=truncated & ~terminated,
