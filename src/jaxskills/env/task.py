@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks: the parameters of a family of skills, a short value that a user writes (FS section 4.2).
+
+    JUMP = TaskSpec(
+        parameters=(
+            Parameter("gravity", (0.2, 1.65), condition=conditions.gravity),
+            Parameter("energy", (0.8, 1.8), measure=measure.at(0.43, measure.kinetic_energy)),
+        )
+    )
+
+A parameter is either measured in the performance, which the task reward asks for, or a condition
+that is set before it. Ranges are in multiples of the reference. Learning sees parameters
+*normalised*: 0 at the lower end of the range, 1 at the upper. A range of no width is a constraint:
+it is asked for too, but is no parameter.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from jaxskills import kinematics
+from jaxskills.character import Character
+from jaxskills.env import measure as measure_lib
+from jaxskills.env.measure import Measure, Moment
+from jaxskills.errors import UserError, unknown
+from jaxskills.motion import CONTROL_DT, Motion, sample
+
+# Changes the model of a character on the host: (spec, character, factor).
+Condition = Callable[[mujoco.MjSpec, Character, float], None]
+
+_FINEST = 4  # steps in a control frame when the reference is measured
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """One task parameter, or a constraint if its range has no width."""
+
+    name: str
+    range: tuple[float, float]  # lower and upper end
+    measure: Measure | None = None
+    condition: Condition | None = None
+    relative: bool = True  # the range is in multiples of the reference's own value; else absolute
+    sigma: float = 0.2  # of the task reward (FS eq. 8), in units of the range
+    continuous: bool = False  # the quantity is asked for all the way, not its measure at the end
+
+    @property
+    def fixed(self) -> bool:
+        """Whether it is a constraint."""
+        return self.range[0] == self.range[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskSpec:
+    """What a family of skills varies in."""
+
+    parameters: tuple[Parameter, ...] = ()
+    spike_weight: float = 10.0  # w_task of FS section 4.2 for spike rewards
+    continuous_weight: float = 0.1  # and for continuous ones
+
+    @property
+    def free(self) -> tuple[Parameter, ...]:
+        """The P parameters, without constraints."""
+        return tuple(p for p in self.parameters if not p.fixed)
+
+    @property
+    def measured(self) -> tuple[Parameter, ...]:
+        """The M parameters and constraints that are measured."""
+        return tuple(p for p in self.parameters if p.measure is not None)
+
+
+class Task(NamedTuple):
+    """Pure functions of one performance."""
+
+    start: Callable[[], jax.Array]  # () -> known [M, 2]
+    # (known, before, after, shares (2), a [P]) -> known, rate [], spike []
+    step: Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
+    # (known, a [P]) -> [P + M] what the policy sees
+    observe: Callable[[jax.Array, jax.Array], jax.Array]
+    # (known, a [P]) -> the parameter that was met [P], how well constraints were [] in 0 to 1
+    hindsight: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+    reference: jax.Array  # [M] what the reference measures
+    base: np.ndarray  # [P] normalised parameter of the reference
+    end: float  # share of the reference by which everything is known
+
+
+def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
+    """Returns the task of a specification, for a character and its reference.
+
+    Raises:
+      UserError: a broken specification, or a quantity that the reference has nothing of.
+    """
+    validate(spec)
+    measured, free = spec.measured, spec.free
+    measures = [_measure(p) for p in measured]
+    reads = [m.quantity(character) for m in measures]
+    own = reference_values(spec, character, motion)
+    for parameter, value in zip(measured, own, strict=True):
+        if parameter.relative and abs(value) < 1e-6:
+            raise UserError(
+                f"parameter {parameter.name}: the reference measures {value:.2g}, of which there"
+                " are no multiples: give an absolute range with relative=False"
+            )
+    unit = jnp.array([v if p.relative else 1.0 for p, v in zip(measured, own, strict=True)])
+    low, width = (jnp.array([f(p.range) for p in measured]) for f in (lambda r: r[0], _width))
+    sigma = jnp.array([p.sigma for p in measured])
+    place = np.array([free.index(p) if p in free else 0 for p in measured], int)
+    fixed = np.array([p.fixed for p in measured], bool)
+    steady = np.array([p.continuous for p in measured], bool)
+    at_end = [i for i, p in enumerate(measured) if not p.continuous]
+    end = max((measures[i].end for i in at_end), default=1.0)
+    wanted = lambda a: low + width * a[place] if len(free) else low  # noqa: E731
+
+    def values(known: jax.Array) -> jax.Array:
+        rows = [measure_lib.value(m, known[i]) for i, m in enumerate(measures)]
+        return jnp.stack(rows) / unit if rows else jnp.zeros(0)
+
+    def start() -> jax.Array:
+        rows = [measure_lib.start(m) for m in measures]
+        return jnp.stack(rows) if rows else jnp.zeros((0, 2))
+
+    def step(
+        known: jax.Array, before: Moment, after: Moment, shares: tuple[jax.Array, jax.Array], a
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        if not measures:
+            return known, jnp.float32(0.0), jnp.float32(0.0)
+        now = jnp.stack([read(after) for read in reads])
+        then = jnp.stack([read(before) for read in reads])
+        rows = [
+            measure_lib.update(m, known[i], then[i], now[i], shares, CONTROL_DT)
+            for i, m in enumerate(measures)
+        ]
+        known = jnp.stack(rows)
+        off = ((values(known) - wanted(a)) / sigma) ** 2
+        passed = (shares[0] < end) & (end <= shares[1])
+        reward = jnp.exp(-jnp.sum(jnp.where(steady, 0.0, off)))
+        spike = jnp.where(passed & bool(at_end), spec.spike_weight * reward, 0.0)
+        during = jnp.array([m.begin for m in measures]) <= shares[1]
+        during &= shares[1] <= jnp.array([m.end for m in measures])
+        tracked = jnp.exp(-(((now / unit - wanted(a)) / sigma) ** 2)) * during * steady
+        rate = spec.continuous_weight * jnp.sum(tracked) / max(int(steady.sum()), 1)
+        return known, rate, spike
+
+    def observe(known: jax.Array, a: jax.Array) -> jax.Array:
+        return jnp.concatenate((a, jnp.clip(values(known), -10.0, 10.0)))
+
+    def hindsight(known: jax.Array, a: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found = values(known)
+        for i, parameter in enumerate(measured):
+            if not parameter.fixed:
+                a = a.at[place[i]].set((found[i] - low[i]) / width[i])
+        off = jnp.where(fixed, ((found - low) / sigma) ** 2, 0.0) if measures else jnp.zeros(1)
+        return a, jnp.exp(-jnp.sum(off))
+
+    base = np.array([normalised(p, _own(p, measured, own)) for p in free])
+    return Task(start, step, observe, hindsight, jnp.asarray(own, jnp.float32), base, end)
+
+
+def reference_values(spec: TaskSpec, character: Character, motion: Motion) -> np.ndarray:
+    """Returns what the reference itself measures `[M]`, played at its own speed."""
+    tree = kinematics.tree(character.model)
+    params = kinematics.body_params(character.model)
+    length, layout = float(motion.length), character.layout
+    shares = np.linspace(0.0, 1.0, max(2, math.ceil(length * _FINEST) + 1))
+
+    def look(share: jax.Array) -> Moment:
+        # Just before the end: a motion that does not loop is at rest at its end.
+        phase = jnp.minimum(share, 1.0 - 1e-6) * motion.length
+        bodies = kinematics.kinematics(tree, params, *sample(layout, motion, phase))
+        return Moment(params, bodies)
+
+    moments = jax.jit(jax.vmap(look))(jnp.asarray(shares, jnp.float32))
+    seconds = length * CONTROL_DT / (len(shares) - 1)
+    found = []
+    for parameter in spec.measured:
+        made = _measure(parameter)
+        course = np.asarray(jax.vmap(made.quantity(character))(moments))
+        known = measure_lib.start(made)
+        for i in range(1, len(shares)):
+            both = jnp.float32(course[i - 1]), jnp.float32(course[i])
+            step = jnp.float32(shares[i - 1]), jnp.float32(shares[i])
+            known = measure_lib.update(made, known, *both, step, seconds)
+        found.append(float(measure_lib.value(made, known)))
+    return np.array(found)
+
+
+def normalised(parameter: Parameter, value: float) -> float:
+    """Returns a value, in units of the range, as a share of the range."""
+    return (value - parameter.range[0]) / _width(parameter.range)
+
+
+def in_units(spec: TaskSpec, a: np.ndarray) -> dict[str, float]:
+    """Returns normalised parameters `[P]` by name, in units of their ranges."""
+    pairs = zip(spec.free, np.asarray(a), strict=True)
+    return {p.name: float(p.range[0] + _width(p.range) * value) for p, value in pairs}
+
+
+def from_units(spec: TaskSpec, values: dict[str, float]) -> np.ndarray:
+    """Returns the normalised parameters `[P]` of values by name.
+
+    Raises:
+      UserError: an unknown or missing name, or a value outside its range.
+    """
+    names = [p.name for p in spec.free]
+    for name in values:
+        if name not in names:
+            raise unknown("task parameter", name, names)
+    found = []
+    for parameter in spec.free:
+        if parameter.name not in values:
+            raise UserError(f"task parameter {parameter.name} is missing: give it a value")
+        value, (low, high) = values[parameter.name], parameter.range
+        if not low <= value <= high:
+            raise UserError(f"task parameter {parameter.name} is {value}: give {low} to {high}")
+        found.append(normalised(parameter, value))
+    return np.array(found)
+
+
+def validate(spec: TaskSpec) -> None:
+    """Checks a specification.
+
+    Raises:
+      UserError: a name twice, a range out of order, neither or both of measure and condition.
+    """
+    names = [p.name for p in spec.parameters]
+    for p in spec.parameters:
+        if names.count(p.name) > 1:
+            raise UserError(f"task parameter {p.name} comes twice: give each its own name")
+        if not (all(map(math.isfinite, p.range)) and p.range[0] <= p.range[1]):
+            raise UserError(f"task parameter {p.name}: range {p.range}: give two numbers in order")
+        if (p.measure is None) == (p.condition is None):
+            raise UserError(f"task parameter {p.name}: give either a measure or a condition")
+        if p.fixed and p.measure is None:
+            raise UserError(f"task parameter {p.name}: a range of no width needs a measure")
+        if not p.sigma > 0:
+            raise UserError(f"task parameter {p.name}: sigma {p.sigma}: give a positive number")
+        if p.measure is not None:
+            measure_lib.validate(p.name, p.measure)
+
+
+def _measure(parameter: Parameter) -> Measure:
+    if parameter.measure is None:
+        raise UserError(f"task parameter {parameter.name} is not measured")
+    return parameter.measure
+
+
+def _width(ends: tuple[float, float]) -> float:
+    return ends[1] - ends[0]
+
+
+def _own(parameter: Parameter, measured: tuple[Parameter, ...], values: np.ndarray) -> float:
+    """Returns the reference's own place in a range: 1 of its multiples, or what it measures."""
+    if parameter.relative:
+        return 1.0
+    return float(values[measured.index(parameter)]) if parameter in measured else 0.0
