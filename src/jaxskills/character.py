@@ -8,6 +8,7 @@ follow from the mass and leaf bodies are the end effectors.
 
 import dataclasses
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -142,7 +143,10 @@ def load(name: str) -> Character:
 
 
 def compile(  # noqa: A001
-    character: Character, timestep: float, integrator: str = "discrete"
+    character: Character,
+    timestep: float,
+    integrator: str = "discrete",
+    edit: Callable[[mujoco.MjSpec], None] | None = None,
 ) -> mujoco.MjModel:
     """Returns the model with one position servo per actuated degree of freedom.
 
@@ -156,6 +160,7 @@ def compile(  # noqa: A001
       character: what to compile.
       timestep: h in s.
       integrator: one of `INTEGRATORS`.
+      edit: changes the spec before servos are added, for a variant of the character.
 
     Raises:
       UserError: unknown integrator.
@@ -163,6 +168,8 @@ def compile(  # noqa: A001
     if integrator not in INTEGRATORS:
         raise unknown("integrator", integrator, INTEGRATORS)
     spec = _bare_spec(Path(character.source))
+    if edit is not None:
+        edit(spec)
     spec.option.timestep = timestep
     spec.option.integrator = INTEGRATORS[integrator]
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
