@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Task specifications: what they ask for, what they pay, and which parameter was met instead."""
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import tiny
+
+from jaxskills import kinematics
+from jaxskills.character import Character
+from jaxskills.env import conditions, measure, task
+from jaxskills.env.measure import Moment
+from jaxskills.env.task import Parameter, TaskSpec
+from jaxskills.errors import UserError
+from jaxskills.motion import Motion
+
+HEIGHT = Parameter("height", (0.8, 1.6), measure=measure.at(0.5, measure.com_height))
+TIME = Parameter("time", (1.0, 1.0), measure=measure.duration(0.2, 0.8))
+GRAVITY = Parameter("gravity", (0.5, 2.0), condition=conditions.gravity)
+SPEC = TaskSpec((GRAVITY, HEIGHT, TIME))
+
+
+@pytest.fixture(scope="module")
+def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
+    return tiny.load_character(tmp_path_factory.mktemp("who"))
+
+
+@pytest.fixture(scope="module")
+def walk(who: Character) -> Motion:
+    return tiny.make_motion(who, tiny.walking(), True)
+
+
+@pytest.fixture(scope="module")
+def made(who: Character, walk: Motion) -> task.Task:
+    return task.make(SPEC, who, walk)
+
+
+def _moment(who: Character, height: float) -> Moment:
+    qpos = jnp.asarray(tiny.standing()[0], jnp.float32)
+    params = kinematics.body_params(who.model)
+    tree = kinematics.tree(who.model)
+    bodies = kinematics.kinematics(tree, params, qpos, jnp.zeros(who.layout.nv))
+    return Moment(params, bodies.replace(com=bodies.com.at[2].set(height)))
+
+
+def _play(who: Character, made: task.Task, a: list[float], height: float, steps: int = 30):
+    """Returns what is known, and rate and spike of each step, at even speed and this height."""
+    known, rows, now = made.start(), [], _moment(who, height)
+    for i in range(steps):
+        shares = jnp.float32(i / steps), jnp.float32((i + 1) / steps)
+        known, rate, spike = made.step(known, now, now, shares, jnp.array(a))
+        rows.append((float(rate), float(spike)))
+    return known, np.array(rows)
+
+
+def test_the_reference_measures_itself(walk: Motion, made: task.Task, who: Character):
+    height, seconds = made.reference
+    assert seconds == pytest.approx(0.6 * walk.seconds, rel=1e-3)
+    data = mujoco.MjData(who.model)
+    data.qpos[:] = walk.qpos[15]
+    mujoco.mj_forward(who.model, data)
+    assert float(height) == pytest.approx(data.subtree_com[1, 2], rel=1e-4)
+    # Gravity and height of the reference are 1 in units of the range.
+    np.testing.assert_allclose(made.base, [0.5 / 1.5, 0.25], atol=1e-6)
+
+
+def test_the_spike_comes_once_when_everything_is_known(who: Character, made: task.Task):
+    height = float(made.reference[0])
+    _, rows = _play(who, made, [0.9, 0.25], height)
+    assert np.flatnonzero(rows[:, 1]).tolist() == [23] and not rows[:, 0].any()  # at 24/30 = 0.8
+    assert rows[23, 1] == pytest.approx(10.0, rel=1e-3)
+    # Asked for 1.2 times the height but 1.0 of it reached: exp(-(0.2 / 0.2)^2).
+    _, rows = _play(who, made, [0.9, 0.5], height)
+    assert rows[23, 1] == pytest.approx(10.0 * np.exp(-1.0), rel=1e-3)
+
+
+def test_a_constraint_is_asked_for_too(who: Character, made: task.Task):
+    """A performance of 60 steps takes twice as long: exp(-(1 / 0.2)^2)."""
+    height = float(made.reference[0])
+    known, rows = _play(who, made, [0.9, 0.25], height, steps=60)
+    assert rows[:, 1].sum() == pytest.approx(10.0 * np.exp(-25.0), rel=1e-2)
+    assert float(made.hindsight(known, jnp.array([0.9, 0.25]))[1]) == pytest.approx(np.exp(-25.0))
+
+
+def test_hindsight_keeps_conditions_and_takes_what_was_measured(who: Character, made: task.Task):
+    known, _ = _play(who, made, [0.9, 0.1], 1.4 * float(made.reference[0]))
+    a, constraint = made.hindsight(known, jnp.array([0.9, 0.1]))
+    np.testing.assert_allclose(a, [0.9, 0.75], atol=1e-4)
+    assert float(constraint) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_continuous_parameter_pays_on_the_way(who: Character, walk: Motion):
+    steady = Parameter(
+        "height",
+        (0.8, 1.6),
+        measure=measure.mean(measure.com_height, 0.2, 0.8),
+        continuous=True,
+    )
+    made = task.make(TaskSpec((steady,)), who, walk)
+    _, rows = _play(who, made, [0.25], float(made.reference[0]))
+    paid = np.flatnonzero(rows[:, 0])
+    assert (paid[0], paid[-1], rows[:, 1].any()) == (5, 23, False)
+    np.testing.assert_allclose(rows[paid, 0], 0.1, rtol=1e-4)
+
+
+def test_the_policy_sees_the_parameter_and_what_is_known(who: Character, made: task.Task):
+    known, _ = _play(who, made, [0.9, 0.25], float(made.reference[0]))
+    seen = made.observe(known, jnp.array([0.9, 0.25]))
+    np.testing.assert_allclose(seen, [0.9, 0.25, 1.0, 1.0], atol=1e-3)
+
+
+def test_a_task_without_measures(who: Character, walk: Motion):
+    made = task.make(TaskSpec((GRAVITY,)), who, walk)
+    known, rows = _play(who, made, [0.5], 1.0)
+    assert known.shape == (0, 2) and not rows.any()
+    a, constraint = made.hindsight(known, jnp.array([0.5]))
+    assert (float(a[0]), float(constraint)) == (0.5, 1.0)
+
+
+def test_units_there_and_back():
+    a = task.from_units(SPEC, {"height": 1.2, "gravity": 2.0})
+    np.testing.assert_allclose(a, [1.0, 0.5])
+    assert task.in_units(SPEC, a) == pytest.approx({"gravity": 2.0, "height": 1.2})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"hieght": 1.0}, "unknown task parameter 'hieght': choose one of gravity, height"),
+        ({"height": 1.0}, "task parameter gravity is missing: give it a value"),
+        ({"height": 2.0, "gravity": 1.0}, "task parameter height is 2.0: give 0.8 to 1.6"),
+    ],
+)
+def test_wrong_values_are_refused(values: dict[str, float], message: str):
+    with pytest.raises(UserError) as raised:
+        task.from_units(SPEC, values)
+    assert str(raised.value) == message
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ((HEIGHT, HEIGHT), "height comes twice"),
+        ((Parameter("x", (2.0, 1.0), condition=conditions.gravity),), "two numbers in order"),
+        ((Parameter("x", (1.0, 2.0)),), "either a measure or a condition"),
+        ((Parameter("x", (1.0, 1.0), condition=conditions.gravity),), "needs a measure"),
+        (
+            (Parameter("x", (1.0, 2.0), measure=HEIGHT.measure, sigma=0.0),),
+            "sigma 0.0: give a positive number",
+        ),
+    ],
+)
+def test_broken_specifications_are_refused(parameters: tuple[Parameter, ...], message: str):
+    with pytest.raises(UserError, match=message):
+        task.validate(TaskSpec(parameters))
+
+
+def test_what_the_reference_has_nothing_of_has_no_multiples(who: Character, walk: Motion):
+    still = Parameter("spin", (0.5, 2.0), measure=measure.total(lambda c: lambda m: 0.0, 0.2, 0.8))
+    with pytest.raises(UserError, match="no multiples: give an absolute range"):
+        task.make(TaskSpec((still,)), who, walk)
