@@ -28,8 +28,8 @@ env.observe env.bounds env.bounds_file env.rewards env.style env.gram env.varian
 env.measure env.task env.conditions env.core env
 learn.networks learn.normalize learn.windows learn.autoencoder learn.gae learn.ppo learn.rollout
 learn
-explore.starts explore.evolution explore.adaptive explore.refine explore.marginal explore.sampling
-explore.curriculum explore
+explore.starts explore.evolution explore.adaptive explore.refine explore.elites
+explore.marginal explore.sampling explore.curriculum explore
 
 trainer checkpoint evaluate style_measures train
 render.opengl render.stage render.take render.video render.strip render
