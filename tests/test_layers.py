@@ -29,7 +29,7 @@ env.measure env.task env.conditions env.core env
 learn.networks learn.normalize learn.windows learn.autoencoder learn.gae learn.ppo learn.rollout
 learn
 explore.starts explore.evolution explore.adaptive explore.refine explore.elites
-explore.marginal explore.sampling explore.curriculum explore
+explore.parameterization explore.marginal explore.sampling explore.curriculum explore
 
 trainer checkpoint evaluate style_measures train
 render.opengl render.stage render.take render.video render.strip render
