@@ -24,8 +24,8 @@ kinematics ground motion variation trace
 
 physics.quiet physics.ffi physics.base physics.cpu physics.box_floor physics.explicit
 physics.mjx physics.servo physics
-env.observe env.bounds env.bounds_file env.rewards env.style env.gram env.variants
-env.measure env.task env.conditions env.core env
+env.observe env.bounds env.bounds_file env.rewards env.tracking env.style env.gram
+env.variants env.measure env.task env.conditions env.core env
 learn.networks learn.normalize learn.windows learn.autoencoder learn.gae learn.ppo learn.rollout
 learn
 explore.starts explore.evolution explore.adaptive explore.refine explore.elites
