@@ -28,7 +28,7 @@ env.observe env.bounds env.bounds_file env.rewards env.tracking env.style env.gr
 env.variants env.measure env.task env.conditions env.core env
 learn.networks learn.normalize learn.windows learn.autoencoder learn.gae learn.ppo learn.rollout
 learn
-explore.starts explore.evolution explore.adaptive explore.refine explore.elites
+explore.starts explore.evolution explore.adaptive explore.refine explore.fitness explore.elites
 explore.parameterization explore.marginal explore.sampling explore.curriculum explore
 
 trainer checkpoint evaluate style_measures train
