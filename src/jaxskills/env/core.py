@@ -16,10 +16,14 @@ import numpy as np
 from flax import struct
 
 from jaxskills import ground, kinematics, pose
+from jaxskills import variation as variation_lib
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import gram, observe, rewards
 from jaxskills.env import style as style_lib
+from jaxskills.env import tracking as tracking_lib
+from jaxskills.env.measure import Moment
+from jaxskills.env.task import Task
 from jaxskills.env.variants import Variant, Variants, pick
 from jaxskills.errors import UserError
 from jaxskills.kinematics import Bodies
@@ -45,9 +49,15 @@ class EnvConfig:
     # 0.1 s for DeepMimic's gains, and a run leaves its bounds within 0.1 s by its knees alone.
     velocity_feedforward: bool = True
     feedforward: bool = True  # off: displacements are from the zero pose, not from the reference
-    # What a step inside the bounds earns: 1, DeepMimic's imitation, a style (SB eq. 8), or both
-    # weighted (SB eq. 13, for comparison).
-    reward: Literal["survival", "imitation", "style", "blend"] = "survival"
+    # What a step inside the bounds earns: 1, DeepMimic's imitation, a style (SB eq. 8), both
+    # weighted (SB eq. 13, for comparison), or tracking and a task (FS eq. 5).
+    reward: Literal["survival", "imitation", "style", "blend", "tracking"] = "survival"
+    tracking: tracking_lib.TrackingConfig = tracking_lib.TrackingConfig()
+    # The policy chooses how fast phase goes by too, FS eq. 3 and 4. Scale and limits of the log of
+    # the speed, relative to the reference's own, are those of the authors' code.
+    time_warp: bool = False
+    warp_scale: float = 1.5
+    warp_limits: tuple[float, float] = (-2.0, 1.0)
     style: style_lib.StyleConfig = style_lib.StyleConfig()
     style_weight: float = 0.5  # of the style in a blend, w_s of SB eq. 13
     stop: Literal["bounds", "fall"] = "bounds"  # what ends an episode; DeepMimic: a fall
@@ -65,6 +75,7 @@ class EnvState:
     variant: jax.Array  # [] int32, which of the `Variants` it is
     scale: jax.Array | None = None  # [] that multiplies the sizes of the bounds; None: 1
     window: gram.Window | None = None  # the motion up to now, if the style is gram
+    known: jax.Array | None = None  # [M, 2] what is known of the task's measures, if there is one
 
 
 @struct.dataclass
@@ -125,6 +136,7 @@ def make(
     bounds: bounds_lib.Bounds,
     config: EnvConfig,
     wanted: gram.Style | None = None,
+    task: Task | None = None,
 ) -> Environment:
     """Returns the environment of a character that follows a reference.
 
@@ -135,6 +147,7 @@ def make(
       bounds: sizes of the spacetime bounds.
       config: what an episode is.
       wanted: the style, if it is gram.
+      task: what is asked for besides the motion, if anything.
     """
     validate(config)
     if (wanted is None) == (config.style.style == "gram"):
@@ -167,7 +180,19 @@ def make(
         offset = pose.minus(layout, ref_qpos, qpos)
         return _Seen(bodies, reference, offset, ref_qvel - qvel, (both[0], both[1]))
 
+    def natural_speed(state: EnvState) -> jax.Array:
+        own = pick(variants, state.variant)
+        return variation_lib.rate(own.motion, own.variation, state.phase)
+
     def features(state: EnvState, seen: _Seen) -> jax.Array:
+        parts = [_features(state, seen)]
+        if config.time_warp:
+            parts.append(jnp.log(natural_speed(state))[None])
+        if task is not None and state.known is not None:
+            parts.append(task.observe(state.known, pick(variants, state.variant).task))
+        return jnp.concatenate(parts)
+
+    def _features(state: EnvState, seen: _Seen) -> jax.Array:
         return observe.features(
             seen.bodies,
             seen.reference,
@@ -192,18 +217,30 @@ def make(
         qpos = qpos.at[2].add(jnp.maximum(_LIFT_MARGIN - lowest, 0.0))
         sim = physics.init(variants.model, variant, qpos, qvel)
         window = None if wanted is None else gram.fill(wanted, phase)
-        return EnvState(sim, phase, jnp.int32(0), variant, window=window)
+        known = None if task is None else task.start()
+        return EnvState(sim, phase, jnp.int32(0), variant, window=window, known=known)
 
     def observe_state(state: EnvState) -> jax.Array:
         return features(state, look(state))
 
-    def advance(state: EnvState, action: jax.Array) -> tuple[SimState, jax.Array]:
+    def speeds(state: EnvState, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns how much phase the step takes, and how much the reference would."""
+        if not config.time_warp:
+            return jnp.float32(1.0), jnp.float32(1.0)
+        natural = natural_speed(state)
+        warp = jnp.clip(config.warp_scale * action[-1], *config.warp_limits)
+        return natural * jnp.exp(warp), natural
+
+    def advance(
+        state: EnvState, action: jax.Array, taken: tuple[jax.Array, jax.Array]
+    ) -> tuple[SimState, jax.Array]:
         base, speed = neutral, jnp.zeros(layout.nv)
         if config.feedforward:
-            own = pick(variants, state.variant)
-            base, ahead = sample(layout, own.motion, state.phase + config.lead)
-            speed = ahead if config.velocity_feedforward else speed
-        target = pose.plus(layout, base, jnp.zeros(layout.nv).at[dofs].set(action))
+            own, (chosen, natural) = pick(variants, state.variant), taken
+            base, ahead = sample(layout, own.motion, state.phase + config.lead * chosen)
+            speed = ahead * (chosen / natural) if config.velocity_feedforward else speed
+        push = action[: len(dofs)]
+        target = pose.plus(layout, base, jnp.zeros(layout.nv).at[dofs].set(push))
 
         def substep(sim: SimState, _: None) -> tuple[SimState, jax.Array]:
             ctrl = servo.controls(servos, layout, sim.qpos, sim.qvel, target, speed)
@@ -241,10 +278,29 @@ def make(
             return (1.0 - w) * imitation(seen) + w * style(own, seen, before, after)
         return jnp.float32(1.0)
 
+    def tracked(
+        own: Variant,
+        seen: _Seen,
+        before: EnvState,
+        after: EnvState,
+        taken: tuple[jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+        """Returns the rate, the spike and what is known of the task then (FS eq. 5)."""
+        rate = tracking_lib.reward(
+            config.tracking, seen.offset, seen.bodies, seen.reference, effectors, taken
+        )
+        if task is None or before.known is None:
+            return rate, jnp.float32(0.0), None
+        earlier = kinematics.kinematics(tree, own.body, before.sim.qpos, before.sim.qvel)
+        shares = before.phase / length, after.phase / length
+        moments = Moment(own.body, earlier), Moment(own.body, seen.bodies)
+        known, more, spike = task.step(before.known, *moments, shares, own.task)
+        return task.tracking_weight * rate + more, spike, known
+
     def step(state: EnvState, action: jax.Array) -> tuple[EnvState, Outcome]:
-        before, own = state.sim, pick(variants, state.variant)
-        sim, ctrl = advance(state, action)
-        dphase = jnp.float32(1.0)
+        before, own = state, pick(variants, state.variant)
+        dphase, natural = speeds(state, action)
+        sim, ctrl = advance(state, action, (dphase, natural))
         state = dataclasses.replace(state, sim=sim, phase=state.phase + dphase, step=state.step + 1)
         seen = look(state)
         if wanted is not None and state.window is not None:
@@ -276,10 +332,16 @@ def make(
             seen.bodies.com,
             servo.applied_torque(servos, layout, sim.qpos, sim.qvel, ctrl),
         )
+        rate = jnp.float32(0.0)
+        if config.reward == "tracking":
+            rate, spike, known = tracked(own, seen, before, state, (dphase, natural))
+            state = dataclasses.replace(state, known=known)
+        else:
+            spike = reward_of(own, seen, before.sim, state)
         outcome = Outcome(
             obs=features(state, seen),
-            rate=jnp.float32(0.0),
-            spike=jnp.where(terminated, 0.0, reward_of(own, seen, before, state)),
+            rate=jnp.where(terminated, 0.0, rate),
+            spike=jnp.where(terminated, 0.0, spike),
             dphase=dphase,
             terminated=terminated,
             truncated=truncated & ~terminated,
@@ -287,7 +349,8 @@ def make(
         )
         return state, outcome
 
-    return Environment(start, place, observe_state, step, len(dofs), endings, length, end)
+    size = len(dofs) + config.time_warp
+    return Environment(start, place, observe_state, step, size, endings, length, end)
 
 
 def validate(config: EnvConfig) -> None:
@@ -309,5 +372,8 @@ def validate(config: EnvConfig) -> None:
     if not 0 <= config.style_weight <= 1:
         raise UserError(f"env.style_weight is {config.style_weight}: give 0 to 1")
     style_lib.validate(config.style)
+    tracking_lib.validate(config.tracking)
+    if not config.warp_limits[0] <= 0.0 <= config.warp_limits[1]:
+        raise UserError(f"env.warp_limits is {config.warp_limits}: give low <= 0 <= high")
     if not -30 <= config.lead <= 30:
         raise UserError(f"env.lead is {config.lead}: give -30 to 30 control frames")

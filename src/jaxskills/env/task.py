@@ -87,6 +87,7 @@ class Task(NamedTuple):
     reference: jax.Array  # [M] what the reference measures
     base: np.ndarray  # [P] normalised parameter of the reference
     end: float  # share of the reference by which everything is known
+    tracking_weight: float  # w_tracking of FS section 4.2
 
 
 def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
@@ -158,7 +159,9 @@ def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
         return a, jnp.exp(-jnp.sum(off))
 
     base = np.array([normalised(p, _own(p, measured, own)) for p in free])
-    return Task(start, step, observe, hindsight, jnp.asarray(own, jnp.float32), base, end)
+    weight = 1.0 - spec.continuous_weight if steady.any() else 1.0
+    own = jnp.asarray(own, jnp.float32)
+    return Task(start, step, observe, hindsight, own, base, end, weight)
 
 
 def reference_values(spec: TaskSpec, character: Character, motion: Motion) -> np.ndarray:

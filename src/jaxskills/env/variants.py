@@ -13,10 +13,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxskills import ground, kinematics
+from jaxskills import variation as variation_lib
 from jaxskills.character import Character
 from jaxskills.ground import Shapes
 from jaxskills.kinematics import BodyParams
 from jaxskills.motion import Motion
+from jaxskills.variation import Variation
 
 
 @struct.dataclass
@@ -24,6 +26,7 @@ class Variant:
     """One variant, or W of them stacked."""
 
     motion: Motion  # the reference
+    variation: Variation  # what made it of the clip; its speed of phase is part of the reference
     body: BodyParams  # lengths and masses
     shapes: Shapes  # what can touch the ground
     task: jax.Array  # [P] the task parameter, normalised; P is 0 for a skill
@@ -48,13 +51,21 @@ def one(character: Character, motion: Motion, model: Any) -> Variants:
       motion: the reference.
       model: what `physics.load` returned.
     """
-    return stack([row(character, motion, jnp.zeros(0))], model)
+    itself = variation_lib.zeros(2, character.layout.nv)
+    return stack([row(character, motion, itself, jnp.zeros(0))], model)
 
 
-def row(character: Character, motion: Motion, task: jax.Array) -> Variant:
-    """Returns one variant: a character, its reference and its task parameter `[P]`."""
-    shapes = ground.shapes(character.model)
-    return Variant(motion, kinematics.body_params(character.model), shapes, task)
+def row(character: Character, motion: Motion, variation: Variation, task: jax.Array) -> Variant:
+    """Returns one variant.
+
+    Args:
+      character: who; bodies may differ between variants in size and mass.
+      motion: the reference, `variation.displace` of the clip.
+      variation: that made it.
+      task: `[P]` the task parameter, normalised.
+    """
+    params, shapes = kinematics.body_params(character.model), ground.shapes(character.model)
+    return Variant(motion, variation, params, shapes, task)
 
 
 def stack(rows: Sequence[Variant], model: Any) -> Variants:
