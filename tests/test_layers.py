@@ -25,17 +25,18 @@ kinematics ground motion variation trace
 physics.quiet physics.ffi physics.base physics.cpu physics.box_floor physics.explicit
 physics.mjx physics.servo physics
 env.observe env.bounds env.bounds_file env.rewards env.tracking env.style env.gram
-env.variants env.measure env.task env.conditions env.core env
+env.variants env.measure env.task env.conditions env.worlds env.core env
 learn.networks learn.normalize learn.windows learn.autoencoder learn.gae learn.ppo learn.rollout
 learn
 explore.starts explore.evolution explore.adaptive explore.refine explore.fitness explore.elites
-explore.parameterization explore.marginal explore.sampling explore.curriculum explore
+explore.parameterization explore.marginal explore.sampling explore.curriculum explore.family
+explore.episodes explore
 
-trainer checkpoint evaluate style_measures train
+trainer recipes families checkpoint evaluate style_measures train
 render.opengl render.stage render.take render.video render.strip render
 plot.sheet plot.states plot.training plot.starts plot playback provenance
 
-recipes progress arguments commands cli __main__
+progress arguments commands cli __main__
 """.split()
 
 # A package of an extra, and what is slow and seldom needed: imported when used.

@@ -71,7 +71,21 @@ def test_a_recipe_file(tmp_path: Path):
         "from jaxskills.recipes import Recipe\n"
         "RECIPE = Recipe('mine', 'walk', character='me.xml')\n"
     )
-    assert recipes.find(str(file)) == Recipe("mine", "walk", character="me.xml")
+    expected = Recipe("mine", "walk", character="me.xml", source=str(file))
+    assert recipes.find(str(file)) == expected
+
+
+def test_the_task_of_a_family_by_name_and_by_file(tmp_path: Path):
+    assert [p.name for p in recipes.task("pivot_family").parameters] == ["rotation"]
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from jaxskills.recipes import Recipe\n"
+        "from jaxskills.env.task import TaskSpec\n"
+        "RECIPE = Recipe('mine', 'walk', task=TaskSpec())\n"
+    )
+    assert recipes.task(str(file)).parameters == ()
+    with pytest.raises(UserError, match="task is walk: that recipe has no task"):
+        recipes.task("walk")
 
 
 @pytest.mark.parametrize(

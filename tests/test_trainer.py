@@ -51,18 +51,6 @@ def init(made: Trainer, cache: Path) -> Callable[[jax.Array], TrainState]:
     return jit(made.init)
 
 
-def _leaves(tree) -> list[np.ndarray]:
-    """Returns all arrays, keys as their bits."""
-    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
-    leaves = jax.tree.leaves(tree)
-    return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in leaves]
-
-
-def _assert_same_bits(a, b):
-    for x, y in zip(_leaves(a), _leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
-
-
 def _run(update: Update, state: TrainState, updates: int) -> TrainState:
     for _ in range(updates):
         state, _ = update(state)
@@ -71,10 +59,11 @@ def _run(update: Update, state: TrainState, updates: int) -> TrainState:
 
 def test_the_same_seed_gives_the_same_bits(init, update: Update):
     ends = [_run(update, init(jax.random.key(3)), 6) for _ in range(2)]
-    _assert_same_bits(*ends)
+    tiny.assert_same_bits(*ends)
     other = _run(update, init(jax.random.key(4)), 6)
     assert any(
-        not np.array_equal(x, y) for x, y in zip(_leaves(ends[0]), _leaves(other), strict=True)
+        not np.array_equal(x, y)
+        for x, y in zip(tiny.leaves(ends[0]), tiny.leaves(other), strict=True)
     )
 
 
@@ -84,12 +73,13 @@ def test_every_number_is_finite_and_something_is_learnt(init, update: Update):
     for count in range(1, 6):
         state, metrics = update(state)
         assert int(state.updates) == count
-    for leaf in _leaves((state, metrics)):
+    for leaf in tiny.leaves((state, metrics)):
         assert np.isfinite(leaf).all()
     for part in ("policy", "value"):
         before, after = (getattr(x.learner, part) for x in (begin, state))
         assert any(
-            not np.array_equal(x, y) for x, y in zip(_leaves(before), _leaves(after), strict=True)
+            not np.array_equal(x, y)
+            for x, y in zip(tiny.leaves(before), tiny.leaves(after), strict=True)
         )
     assert float(state.normalizer.count) == 8 + 5 * 8 * 4
     assert bool(state.starts.seen.any())
@@ -105,7 +95,7 @@ def test_update_is_traced_once_and_may_reuse_its_input(made: Trainer, init, upda
     compiled = jit(counted, donate=True)
     donated = _run(compiled, init(jax.random.key(0)), 5)
     assert len(traces) == 1
-    _assert_same_bits(donated, _run(update, init(jax.random.key(0)), 5))
+    tiny.assert_same_bits(donated, _run(update, init(jax.random.key(0)), 5))
 
 
 def test_init_and_update_agree_on_shapes_and_types(made: Trainer):
@@ -123,8 +113,8 @@ def test_saved_and_restored_runs_go_on_bit_for_bit(
     half = _run(update, init(jax.random.key(0)), 10)
     checkpoint.save(tmp_path, half, 320)
     restored = checkpoint.restore(tmp_path, made)
-    _assert_same_bits(restored, half)
-    _assert_same_bits(_run(update, restored, 10), straight)
+    tiny.assert_same_bits(restored, half)
+    tiny.assert_same_bits(_run(update, restored, 10), straight)
 
 
 _CONTINUE = """
@@ -162,7 +152,7 @@ def test_a_fresh_process_goes_on_bit_for_bit(
     checkpoint.save(tmp_path, half, 320)
     shared = {"JAX_COMPILATION_CACHE_DIR": str(cache)}
     continued = _continued_elsewhere(tmp_path, tmp_path / "out", made, **shared)
-    _assert_same_bits(continued, _run(update, half, 10))
+    tiny.assert_same_bits(continued, _run(update, half, 10))
 
 
 def test_two_seeds_in_one_program_are_two_runs(made: Trainer, init, update: Update):
@@ -172,7 +162,7 @@ def test_two_seeds_in_one_program_are_two_runs(made: Trainer, init, update: Upda
     together = _run(jit(jax.vmap(made.update)), together, 2)
     for row, state in enumerate(alone):
         one = jax.tree.map(lambda x: x[row], together)  # noqa: B023
-        for x, y in zip(_leaves(one), _leaves(state), strict=True):
+        for x, y in zip(tiny.leaves(one), tiny.leaves(state), strict=True):
             np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-3)
 
 
@@ -186,7 +176,7 @@ def test_starts_evolve(tmp_path: Path):
     assert not np.array_equal(begin.elites.phase, state.elites.phase)
     assert float(state.elites.value.max()) > 0.0
     assert (state.elites.phase >= 0).all() and (state.elites.phase <= made.env.length).all()
-    for leaf in _leaves(state):
+    for leaf in tiny.leaves(state):
         assert np.isfinite(leaf).all()
     # Each elite is near the reference, since it was visited within the bounds.
     heights = np.asarray(state.elites.qpos)[..., 2]
@@ -329,8 +319,8 @@ def test_the_real_walk_gives_the_same_bits_and_goes_on_elsewhere(deepmimic: Path
     made = trainer.make(config)
     init, update = jit(made.init), jit(made.update)
     first, second = (_run(update, init(jax.random.key(0)), 20) for _ in range(2))
-    _assert_same_bits(first, second)
+    tiny.assert_same_bits(first, second)
     half = _run(update, init(jax.random.key(0)), 10)
     checkpoint.write_config(tmp_path, config)
     checkpoint.save(tmp_path, half, 10240)
-    _assert_same_bits(_continued_elsewhere(tmp_path, tmp_path / "out", made), first)
+    tiny.assert_same_bits(_continued_elsewhere(tmp_path, tmp_path / "out", made), first)

@@ -4,8 +4,10 @@
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
 
@@ -145,6 +147,23 @@ def train_config(folder: Path, **changes) -> TrainConfig:
         "ppo": PPOConfig(epochs=2, minibatch=16),
     }
     return TrainConfig(**(settings | changes))
+
+
+def leaves(tree: Any) -> list[np.ndarray]:
+    """Returns all arrays, keys as their bits."""
+    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(tree)]
+
+
+def same_bits(a: Any, b: Any) -> bool:
+    """Returns whether all arrays of both are equal."""
+    return all(np.array_equal(x, y) for x, y in zip(leaves(a), leaves(b), strict=True))
+
+
+def assert_same_bits(a: Any, b: Any) -> None:
+    """Fails unless all arrays of both are equal."""
+    for x, y in zip(leaves(a), leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
 @contextlib.contextmanager

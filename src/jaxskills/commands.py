@@ -79,7 +79,9 @@ def settings(recipe: Recipe | None) -> TrainConfig:
     if recipe is None:
         return TrainConfig()
     config = recipe.config or TrainConfig()
-    return _located(dataclasses.replace(config, clip=recipe.clip, character=recipe.character))
+    task = recipe.source if recipe.task is not None else ""
+    whole = dataclasses.replace(config, clip=recipe.clip, character=recipe.character, task=task)
+    return _located(whole)
 
 
 def settings_of(command: arguments.Train, config: TrainConfig) -> TrainConfig:

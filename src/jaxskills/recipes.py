@@ -11,6 +11,7 @@ from jaxskills.errors import UserError, unknown
 from jaxskills.paths import shipped
 
 if TYPE_CHECKING:
+    from jaxskills.env.task import TaskSpec
     from jaxskills.trainer import TrainConfig
 
 
@@ -22,7 +23,9 @@ class Recipe:
     clip: str  # the name of a shipped or DeepMimic clip, or a path
     character: str = "humanoid34"  # the name of a shipped character, or the path of an MJCF file
     config: "TrainConfig | None" = None  # None: the defaults
+    task: "TaskSpec | None" = None  # what a family of skills varies in; None: one skill
     note: str = ""  # where it comes from, what is particular about it
+    source: str = ""  # where `find` found it: the shipped name, or the file
 
 
 def names() -> list[str]:
@@ -38,16 +41,28 @@ def find(skill: str) -> Recipe:
     """
     path = Path(skill)
     if skill in names():
-        return _read(_folder() / f"{skill}.py")
+        return dataclasses.replace(_read(_folder() / f"{skill}.py"), source=skill)
     if path.suffix == ".py":
         if not path.is_file():
             raise UserError(f"recipe file '{skill}' does not exist")
-        return _read(path)
+        return dataclasses.replace(_read(path), source=str(path.absolute()))
     if path.suffix or path.exists():
         return Recipe(path.stem, str(clip.find(skill)))
     if skill in clip.available():
         return Recipe(path.name, skill)
     raise unknown("skill", skill, [*names(), "a name of `jaxskills clips list`, a clip file"])
+
+
+def task(skill: str) -> "TaskSpec":
+    """Returns what a family of skills varies in, by the recipe's name or file.
+
+    Raises:
+      UserError: no such recipe, or it is of one skill.
+    """
+    found = find(skill).task
+    if found is None:
+        raise UserError(f"task is {skill}: that recipe has no task, so it is no family")
+    return found
 
 
 def _folder() -> Path:

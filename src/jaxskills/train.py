@@ -19,9 +19,10 @@ import jax
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from jaxskills import checkpoint, evaluate, paths, trainer
+from jaxskills import checkpoint, evaluate, families, paths, trainer
 from jaxskills.compilation import jit
 from jaxskills.errors import UserError
+from jaxskills.explore import family
 from jaxskills.motion import CONTROL_DT
 from jaxskills.trainer import TrainConfig, Trainer, TrainState
 
@@ -60,7 +61,7 @@ def train(
       UserError: bad settings, or a run folder that is in use or cannot be resumed.
     """
     begin = time.monotonic()
-    made = trainer.make(config)
+    made = families.make(config)
     history: list[dict[str, Any]] = []
     if resume:
         state = checkpoint.restore(run, made)
@@ -69,21 +70,24 @@ def train(
         update = jit(now.update, donate=True)
     else:
         _claim(run)
-        init, update = _compile(made)
-        state = init(jax.random.key(config.seed))
+        state, update = _begin(made)
     checkpoint.write_config(run, config)
     with _stop_signal() as stopped:
         state, last = _loop(made, update, run, state, history, begin, report, stopped)
     return made, state, last
 
 
-def _compile(made: Trainer) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Returns `init` and `update` compiled, both at the same time: a person waits for them."""
-    init = jit(made.init).lower(jax.random.key(0))
-    with ThreadPoolExecutor(1) as pool:
-        compiled_init = pool.submit(init.compile)
+def _begin(made: Trainer) -> tuple[TrainState, Callable[..., Any]]:
+    """Returns the first state, and `update` compiled."""
+    key = jax.random.key(made.config.seed)
+    init = jit(made.init).lower(key)
+    if made.world is not None:
+        state = init.compile()(key)
+        return state, jit(made.update, donate=True).lower(state, made.world(state)).compile()
+    with ThreadPoolExecutor(1) as pool:  # both at the same time: a person waits for them
+        compiled = pool.submit(init.compile)
         update = jit(made.update, donate=True).lower(init.out_info).compile()
-        return compiled_init.result(), update
+        return compiled.result()(key), update
 
 
 def _loop(
@@ -111,16 +115,20 @@ def _loop(
             elif stopped():
                 why = "interrupted"
             else:
-                state, metrics = update(state)
-                samples += config.envs * config.horizon
+                around = () if made.world is None else (made.world(state),)
+                state, metrics = update(state, *around)
+                samples += made.samples
                 sums.append(jax.device_get(metrics))
-                if sums[-1]["fine"] and not fine:
+                if sums[-1].get("fine", False) and not fine:
                     update, fine = jit(trainer.refined(made).update, donate=True), True
             first = "survival_s" not in last
-            if sums and (len(sums) == _LOG_UPDATES or why or first):
+            many = 1 if made.world else _LOG_UPDATES  # an update of a family takes seconds
+            if sums and (len(sums) == many or why or first):
                 last = line(made, sums, samples, before + time.monotonic() - begin)
                 sums = []
-                if not first:  # few episodes have ended yet, so their mean says nothing
+                if (
+                    not first and made.world is None
+                ):  # few episodes have ended yet, so their mean says nothing
                     last |= judge(state, last["survival_s"])
                 if judge.learnt:
                     why = "learnt"
@@ -209,7 +217,8 @@ def line(
         "value_loss": float(total["value_loss"] / count),
         "policy_lr": float(total["policy_lr"] / count),
         "diverged": int(total["diverged"]),
-        **({"fine": True} if metrics[-1]["fine"] else {}),
+        **({"fine": True} if metrics[-1].get("fine", False) else {}),
+        **{k: np.asarray(v).item() for k, v in metrics[-1].items() if k in family.WATCHED},
         **({"bound_scale": float(metrics[-1]["bound_scale"])} if "bound_scale" in total else {}),
         **ended,
     }

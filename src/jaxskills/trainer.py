@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from jaxskills.env import core, gram, variants
 from jaxskills.errors import UserError
 from jaxskills.explore import adaptive as adaptive_lib
 from jaxskills.explore import evolution as evolution_lib
+from jaxskills.explore import family as family_lib
 from jaxskills.explore import refine as refine_lib
 from jaxskills.explore import starts as starts_lib
 from jaxskills.learn import autoencoder, gae, normalize, rollout
@@ -41,6 +42,7 @@ class TrainConfig:
     """Everything that decides a run, besides the machine."""
 
     clip: str = "walk"
+    task: str = ""  # the recipe, or its file, that says what a family varies in; none: one skill
     character: str = "humanoid34"
     backend: Literal["auto", "cpu", "mjx", "warp"] = "auto"
     seed: int = 0
@@ -55,6 +57,7 @@ class TrainConfig:
     starts: starts_lib.StartsConfig = starts_lib.StartsConfig()
     evolution: evolution_lib.EvolutionConfig = evolution_lib.EvolutionConfig()
     refine: refine_lib.RefineConfig = refine_lib.RefineConfig()
+    family: family_lib.FamilyConfig = family_lib.FamilyConfig()
     networks: networks_lib.NetworkConfig = networks_lib.NetworkConfig()
     ppo: ppo_lib.PPOConfig = ppo_lib.PPOConfig()
 
@@ -67,12 +70,13 @@ class TrainState:
     normalizer: normalize.Normalizer
     starts: starts_lib.Starts
     elites: evolution_lib.Elites | None  # None: episodes begin on the reference
-    current: rollout.Fresh  # the B environments and what they show
+    current: rollout.Fresh | None  # the B environments and what they show; None: all begin anew
     key: jax.Array  # root of all randomness; the number of updates is folded in
     updates: jax.Array  # [] int32
     samples: jax.Array  # [] uint32, transitions learnt from
     refinement: refine_lib.Refinement  # where it is fine, `refined` says how the next update goes
     adaptive: adaptive_lib.Adaptive | None = None  # None: the bounds stay as they are
+    family: family_lib.Family | None = None  # None: one skill
 
 
 class Trainer(NamedTuple):
@@ -84,7 +88,11 @@ class Trainer(NamedTuple):
     env: core.Environment
     networks: networks_lib.Networks
     init: Callable[[jax.Array], TrainState]  # (key) -> state
-    update: Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
+    # (state) -> state, metrics; of a family (state, world) -> state, metrics
+    update: Callable[..., tuple[TrainState, dict[str, jax.Array]]]
+    samples: int  # transitions of an update
+    # On the host, before each update: (state) -> the bodies and physics that it asks for.
+    world: Callable[[TrainState], Any] | None = None
 
 
 def reference(config: TrainConfig, character: Character) -> Motion:
@@ -94,13 +102,17 @@ def reference(config: TrainConfig, character: Character) -> Motion:
     return motion_lib.from_qpos(character.model, qpos, clip.times, clip.loop, config.motion)
 
 
+def backend(config: TrainConfig) -> str:
+    """Returns the physics backend of a configuration."""
+    return physics_lib.default_backend() if config.backend == "auto" else config.backend
+
+
 def environment(
     config: TrainConfig, character: Character, motion: Motion, envs: int
 ) -> core.Environment:
     """Returns the environment of a configuration, made for batches of `envs`."""
     core.validate(config.env)
-    backend = physics_lib.default_backend() if config.backend == "auto" else config.backend
-    engine = physics_lib.make(backend, 1, num_envs=envs)
+    engine = physics_lib.make(backend(config), 1, num_envs=envs)
     timestep = CONTROL_DT / config.env.substeps
     model = engine.load([character_lib.compile(character, timestep)])
     bounds = bounds_lib.make(character, config.bounds)
@@ -169,6 +181,7 @@ def make(config: TrainConfig) -> Trainer:
         return TrainState(learner, normalizer, starts, elites, current, key, *counts, *more)
 
     def update(state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        assert state.current is not None
         key = jax.random.fold_in(state.key, state.updates)
         start_key, act_key, learn_key, evolve_key = jax.random.split(key, 4)
         current, steps = rollout.collect(
@@ -221,7 +234,8 @@ def make(config: TrainConfig) -> Trainer:
         )
         return new_state, metrics
 
-    return Trainer(config, character, motion, env, nets, init, update)
+    samples = config.envs * config.horizon
+    return Trainer(config, character, motion, env, nets, init, update, samples)
 
 
 def refined(made: Trainer) -> Trainer:

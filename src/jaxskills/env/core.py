@@ -33,7 +33,8 @@ from jaxskills.physics import Physics, SimState, servo
 # How an episode may end besides leaving a named bound.
 OTHER_ENDINGS = ("ground contact", "fall", "diverged", "time limit")
 
-# A start is lifted this far out of the floor; a motion's last pose is held this long.
+# A start is lifted this far out of the floor; an episode lasts this much longer than its motion,
+# whose last pose is held.
 _LIFT_MARGIN = 1e-3  # m
 _HOLD = 15.0  # control frames
 
@@ -61,6 +62,7 @@ class EnvConfig:
     style: style_lib.StyleConfig = style_lib.StyleConfig()
     style_weight: float = 0.5  # of the style in a blend, w_s of SB eq. 13
     stop: Literal["bounds", "fall"] = "bounds"  # what ends an episode; DeepMimic: a fall
+    once: bool = False  # an episode is over soon after the first cycle of a motion that loops
     may_touch: tuple[str, ...] | None = None  # bodies that may touch the ground; None: the feet
     heading: Literal["forward", "lateral"] = "forward"  # lateral for backflips and rolls, SB 4.1
 
@@ -166,7 +168,7 @@ def make(
     neutral = jnp.asarray(character.model.qpos0, jnp.float32)
     max_steps = round(config.seconds / CONTROL_DT)
     length, loop = variants.length, variants.loop
-    end = math.inf if loop else length + _HOLD
+    end = math.inf if loop and not config.once else length + _HOLD
     endings = (*bounds.names, *OTHER_ENDINGS)
 
     def look(state: EnvState) -> _Seen:

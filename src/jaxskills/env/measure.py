@@ -9,11 +9,13 @@ much it changes, how long it takes. Phases are shares of the reference, 0 to 1.
     spin = measure.total(measure.turning("root"), 0.2, 0.8)
 """
 
+import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxskills import kinematics
 from jaxskills.character import Character
@@ -124,6 +126,32 @@ def com_along(direction: tuple[float, float, float]) -> Quantity:
     """m, where the centre of mass is along a direction of the world."""
     way = jnp.asarray(direction, jnp.float32)
     return lambda character: lambda moment: moment.bodies.com @ way
+
+
+def bearing(name: str, origin: tuple[float, float], zero: float) -> Quantity:
+    """rad, the direction in which the centre of a body lies, seen from above.
+
+    Args:
+      name: of the body.
+      origin: where it is seen from, x and y in m.
+      zero: the direction that counts as 0, rad from x to y.
+    """
+
+    def read(moment: Moment, index: int) -> jax.Array:
+        away = _center(moment, index)[:2] - jnp.array(origin)
+        return jnp.arctan2(away @ jnp.array(_way(zero + math.pi / 2)), away @ jnp.array(_way(zero)))
+
+    return _of_body(name, read)
+
+
+def ground_height(character: Character) -> Read:
+    """m, of the highest of the bodies that are made to touch the ground, the feet."""
+    rows = np.array([character.body(name) for name in character.ground])
+    return lambda moment: jnp.max(moment.bodies.pos[rows, 2])
+
+
+def _way(angle: float) -> tuple[float, float]:
+    return math.cos(angle), math.sin(angle)
 
 
 def _of_body(name: str, read: Callable[[Moment, int], jax.Array]) -> Quantity:

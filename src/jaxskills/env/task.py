@@ -86,6 +86,7 @@ class Task(NamedTuple):
     hindsight: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
     reference: jax.Array  # [M] what the reference measures
     base: np.ndarray  # [P] normalised parameter of the reference
+    begin: float  # share of the reference before which nothing is measured
     end: float  # share of the reference by which everything is known
     tracking_weight: float  # w_tracking of FS section 4.2
 
@@ -114,6 +115,7 @@ def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
     fixed = np.array([p.fixed for p in measured], bool)
     steady = np.array([p.continuous for p in measured], bool)
     at_end = [i for i, p in enumerate(measured) if not p.continuous]
+    begin = min((measures[i].begin for i in at_end), default=1.0)
     end = max((measures[i].end for i in at_end), default=1.0)
     wanted = lambda a: low + width * a[place] if len(free) else low  # noqa: E731
 
@@ -148,7 +150,8 @@ def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
         return known, rate, spike
 
     def observe(known: jax.Array, a: jax.Array) -> jax.Array:
-        return jnp.concatenate((a, jnp.clip(values(known), -10.0, 10.0)))
+        now = values(known)
+        return jnp.concatenate((a, jnp.clip(jnp.where(jnp.isfinite(now), now, 0.0), -10.0, 10.0)))
 
     def hindsight(known: jax.Array, a: jax.Array) -> tuple[jax.Array, jax.Array]:
         found = values(known)
@@ -161,7 +164,7 @@ def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
     base = np.array([normalised(p, _own(p, measured, own)) for p in free])
     weight = 1.0 - spec.continuous_weight if steady.any() else 1.0
     own = jnp.asarray(own, jnp.float32)
-    return Task(start, step, observe, hindsight, own, base, end, weight)
+    return Task(start, step, observe, hindsight, own, base, begin, end, weight)
 
 
 def reference_values(spec: TaskSpec, character: Character, motion: Motion) -> np.ndarray:

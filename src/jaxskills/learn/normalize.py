@@ -38,3 +38,14 @@ def apply(state: Normalizer, obs: jax.Array) -> jax.Array:
     """Returns `obs [..., O]` in standard deviations from the mean, clipped."""
     deviation = jnp.maximum(jnp.sqrt(state.var), _FLOOR)
     return jnp.clip((obs - state.mean) / deviation, -_CLIP, _CLIP)
+
+
+def pin(state: Normalizer, place: int, mean: jax.Array, deviation: jax.Array) -> Normalizer:
+    """Returns the statistics with those of some entries, from `place` on, as given.
+
+    For what hardly varies at first and will later: seen through its early deviation it would jump.
+    """
+    rows = slice(place, place + mean.shape[0])
+    return Normalizer(
+        state.count, state.mean.at[rows].set(mean), state.var.at[rows].set(deviation**2)
+    )

@@ -39,9 +39,10 @@ class Transition:
     ended_by: jax.Array  # [T, B] int32
 
 
-def begin(env: Environment, phase: jax.Array) -> Fresh:
-    """Returns starts on the reference at `phase [B]`."""
-    return _observed(env, jax.vmap(env.start)(phase))
+def begin(env: Environment, phase: jax.Array, variant: jax.Array | None = None) -> Fresh:
+    """Returns starts on the reference at `phase [B]`, of variants `[B]` or of the only one."""
+    own = () if variant is None else (variant,)
+    return _observed(env, jax.vmap(env.start)(phase, *own))
 
 
 def begin_at(env: Environment, phase: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Fresh:
@@ -63,16 +64,19 @@ def collect(
     key: jax.Array,
     horizon: int,
     renewal: float = 0.0,
+    mixed: bool = True,
 ) -> tuple[Fresh, Transition]:
     """Returns the environments after `horizon` steps and all transitions on the way.
 
-    An environment whose episode ends goes on from a random row of `fresh`, and so does one whose
-    episode is cut off, with chance `renewal` in each step. The key is consumed.
+    An environment whose episode ends goes on from a random row of `fresh`, or from its own if they
+    are not `mixed`, and so does one whose episode is cut off, with chance `renewal` in each step.
+    The key is consumed.
     """
     count = current.obs.shape[0]
     noise_key, row_key, cut_key = jax.random.split(key, 3)
     noise = networks.noise * jax.random.normal(noise_key, (horizon, count, env.action_size))
     rows = jax.random.randint(row_key, (horizon, count), 0, count)
+    rows = rows if mixed else jnp.broadcast_to(jnp.arange(count), rows.shape)
     cuts = jax.random.bernoulli(cut_key, renewal, (horizon, count))
 
     def advance(

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FS Table 1, Backflip: how fast one turns in the air, and how high one jumps."""
+
+from jaxskills.env import measure
+from jaxskills.env.core import EnvConfig
+from jaxskills.env.task import Parameter, TaskSpec
+from jaxskills.recipes import Recipe
+from jaxskills.trainer import TrainConfig
+
+# Off the ground, as shares of the clip.
+_AIR = 0.42, 0.66
+
+RECIPE = Recipe(
+    name="backflip_family",
+    clip="backflip",
+    note="A whole turn backwards in the clip. FS Table 1.",
+    task=TaskSpec(
+        (
+            Parameter("spin", (0.5, 2.0), measure=measure.mean(measure.spinning, *_AIR)),
+            Parameter("height", (0.8, 1.3), measure=measure.largest(measure.com_height, *_AIR)),
+            # Constraints.
+            Parameter(
+                "angular_momentum",
+                (1.0, 1.0),
+                measure=measure.mean(measure.angular_momentum("y"), *_AIR),
+            ),
+            Parameter(
+                "rotation",
+                (1.0, 1.0),
+                measure=measure.total(measure.turning("root", "y"), 0.2, 0.9),
+            ),
+        )
+    ),
+    config=TrainConfig(
+        envs=160, env=EnvConfig(reward="tracking", time_warp=True, heading="lateral")
+    ),
+)

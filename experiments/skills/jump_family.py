@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FS Table 1, Jump: energy at take-off, and gravity."""
+
+from jaxskills.env import conditions, measure
+from jaxskills.env.core import EnvConfig
+from jaxskills.env.task import Parameter, TaskSpec
+from jaxskills.recipes import Recipe
+from jaxskills.trainer import TrainConfig
+
+RECIPE = Recipe(
+    name="jump_family",
+    clip="jump",
+    note="0.3 m off the ground in the clip. FS Table 1.",
+    task=TaskSpec(
+        (
+            Parameter("energy", (0.8, 1.8), measure=measure.at(0.44, measure.kinetic_energy)),
+            Parameter("gravity", (0.2, 1.65), condition=conditions.gravity),
+            # A constraint: the feet are down again, and stay.
+            Parameter(
+                "foot_contact",
+                (1.0, 1.0),
+                measure=measure.mean(measure.ground_height, 0.8, 0.95),
+                sigma=0.5,
+            ),
+        )
+    ),
+    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+)
