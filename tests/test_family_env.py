@@ -20,7 +20,7 @@ from jaxskills.motion import Motion
 from jaxskills.physics import Physics, SimState
 from jaxskills.variation import Variation
 
-HEIGHT = Parameter("height", (0.5, 1.5), measure=measure.at(0.5, measure.com_height))
+HEIGHT = Parameter("height", (0.5, 1.5), measure=measure.at(0.5, measure.com_height), sigma=0.2)
 WIDE = BoundsConfig(com=(9.0, 9.0, 9.0), root=9.0, joints=9.0, end_effectors=9.0)
 TRACKING = EnvConfig(reward="tracking", time_warp=True)
 

@@ -15,8 +15,8 @@ from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.errors import UserError
 from jaxskills.motion import Motion
 
-HEIGHT = Parameter("height", (0.8, 1.6), measure=measure.at(0.5, measure.com_height))
-TIME = Parameter("time", (1.0, 1.0), measure=measure.duration(0.2, 0.8))
+HEIGHT = Parameter("height", (0.8, 1.6), measure=measure.at(0.5, measure.com_height), sigma=0.2)
+TIME = Parameter("time", (1.0, 1.0), measure=measure.duration(0.2, 0.8), sigma=0.2)
 GRAVITY = Parameter("gravity", (0.5, 2.0), condition=conditions.gravity)
 SPEC = TaskSpec((GRAVITY, HEIGHT, TIME))
 
@@ -95,6 +95,7 @@ def test_a_continuous_parameter_pays_on_the_way(who: Character, walk: Motion):
         "height",
         (0.8, 1.6),
         measure=measure.mean(measure.com_height, 0.2, 0.8),
+        sigma=0.2,
         continuous=True,
     )
     made = task.make(TaskSpec((steady,)), who, walk)

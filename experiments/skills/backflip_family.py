@@ -23,11 +23,13 @@ RECIPE = Recipe(
                 "angular_momentum",
                 (1.0, 1.0),
                 measure=measure.mean(measure.angular_momentum("y"), *_AIR),
+                sigma=0.2,
             ),
             Parameter(
                 "rotation",
                 (1.0, 1.0),
                 measure=measure.total(measure.turning("root", "y"), 0.2, 0.9),
+                sigma=0.2,
             ),
         )
     ),

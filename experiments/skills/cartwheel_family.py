@@ -26,6 +26,7 @@ RECIPE = Recipe(
                 "rotation",
                 (1.0, 1.0),
                 measure=measure.total(measure.turning("root", "x"), 0.1, 0.9),
+                sigma=0.2,
             ),
         )
     ),

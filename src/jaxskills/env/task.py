@@ -46,7 +46,7 @@ class Parameter:
     measure: Measure | None = None
     condition: Condition | None = None
     relative: bool = True  # the range is in multiples of the reference's own value; else absolute
-    sigma: float = 0.2  # of the task reward (FS eq. 8), in units of the range
+    sigma: float = 0.1  # of the task reward (FS eq. 8), in units of the range
     continuous: bool = False  # the quantity is asked for all the way, not its measure at the end
 
     @property

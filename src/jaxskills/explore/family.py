@@ -32,6 +32,7 @@ WATCHED = (
     "entered",
     "counted",
     "fitness",
+    "task_error",  # share of the range: how far what was met is from what was asked for
     "refining",
     "rate_around",
     "rate_inside",
@@ -154,11 +155,10 @@ def update(
 
     The key is consumed.
     """
-    insert_key, network_key, marginal_key, ask_key = jax.random.split(key, 4)
-    del insert_key
+    network_key, marginal_key, ask_key = jax.random.split(key, 3)
     keeping = roomy(config.elites, results.a.shape[1])
     elites, entered, counted = elites_lib.insert(keeping, family.elites, results.episodes)
-    batch = family.asked.region.shape[0]
+    asked, batch = family.asked.a, family.asked.region.shape[0]
     found = jnp.zeros(batch).at[results.variant].add(counted)
     network = parameterization_lib.update(
         config.parameterization, family.network, elites, network_key
@@ -186,7 +186,7 @@ def update(
     family = jax.lax.cond(
         base.learnt, lambda: _ask(config, keeping, family, ask_key), lambda: family
     )
-    return family, watched(config, family, results, entered, counted)
+    return family, watched(config, family, results, asked, entered, counted)
 
 
 def _ask(
@@ -221,15 +221,18 @@ def watched(
     config: FamilyConfig,
     family: Family,
     results: Results,
+    asked: jax.Array,
     entered: jax.Array,
     counted: jax.Array,
 ) -> dict[str, jax.Array]:
-    """Returns numbers of an update for people."""
+    """Returns numbers of an update for people; `asked [W, P]` was asked for."""
     good = results.episodes.valid
     count = jnp.maximum(jnp.sum(good), 1)
     level = config.curriculum.sampling.visited
     keeping = roomy(config.elites, results.a.shape[1])
     fitness = jnp.sum(jnp.where(good, results.episodes.fitness, 0.0)) / count
+    wrong = jnp.mean(jnp.abs(results.episodes.a - asked[results.variant]), axis=-1)
+    error = jnp.sum(jnp.where(good, wrong, 0.0)) / count
     values = (
         family.episodes,
         family.base.learnt,
@@ -239,6 +242,7 @@ def watched(
         jnp.sum(entered),
         jnp.sum(counted),
         fitness,
+        error,
         family.curriculum.phase == curriculum_lib.REFINEMENT,
         family.curriculum.rate[0],
         family.curriculum.rate[1],
