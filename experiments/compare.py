@@ -76,6 +76,38 @@ def _blends(skill: str, style: str, samples: int) -> dict[str, Case]:
     }
 
 
+def _ablation(skill: str, samples: int) -> dict[str, Case]:
+    """FS Table 2: without parameterisation and time warp, without time warp, and with both.
+
+    The curriculum is the simple one that the paper takes here.
+    """
+    how = f"--samples {samples} --family.curriculum.method fixed_alternation"
+    return {
+        "A1": Case(skill, _of(f"{how} --env.no-time-warp --family.no-vary")),
+        "A2": Case(skill, _of(f"{how} --env.no-time-warp")),
+        "A3": Case(skill, _of(how)),
+    }
+
+
+def _curricula(skill: str, samples: int) -> dict[str, Case]:
+    """FS fig. 8."""
+    how = f"--samples {samples} --family.curriculum.method"
+    methods = {
+        "ours": "alternating_by_rate",
+        "uniform": "uniform",
+        "explore_only": "explore_only",
+        "mastering": "mastering",
+        "alternating": "fixed_alternation",
+    }
+    return {name: Case(skill, _of(f"{how} {method}")) for name, method in methods.items()}
+
+
+def _switched(skill: str, samples: int, on: str, off: str, option: str) -> dict[str, Case]:
+    """A family as it is, and with one option."""
+    how = f"--samples {samples}"
+    return {on: Case(skill, _of(how)), off: Case(skill, _of(f"{how} {option}"))}
+
+
 COMPARISONS: dict[str, dict[str, Case]] = {
     "backflip_starts": {
         "importance": Case("backflip", _of("--samples 6000000")),
@@ -105,6 +137,12 @@ COMPARISONS: dict[str, dict[str, Case]] = {
     "dance_styles": _styles("dance_style", 3_500_000),
     "run_styles": _transfers("run_style", ("happy_walk", "bent_walk"), 2_500_000),
     "cartwheel_blend": _blends("cartwheel", "energy_down", 2_500_000),
+    # Families of skills
+    "spinkick_ablation": _ablation("spinkick_family", 10_000_000),
+    "jump_ablation": _ablation("jump_gravity_family", 10_000_000),
+    "dodge_curricula": _curricula("dodge_family", 4_000_000),
+    "jump_curricula": _curricula("jump_gravity_family", 10_000_000),
+    "dodge_stop": _switched("dodge_family", 4_000_000, "bounds", "fall", "--env.stop fall"),
 }
 
 

@@ -4,9 +4,10 @@
     python experiments/reproduce.py walk run --seeds 0 1 2 --runs runs
 
 For each skill and seed: `jaxskills train` with the default settings, then `jaxskills evaluate` over
-64 episodes at the physics rate of the training and at 600 Hz. One JSON file each is written to
-`experiments/results/`, and the film strip of the first seed. A run folder that exists is resumed,
-so a reproduction that was cut off can be started again. `experiments/tables.py` prints the tables.
+64 episodes, or of a family over 50 new task parameters, at the physics rate of the training and at
+600 Hz. One JSON file each is written to `experiments/results/`, and the film strip of the first
+seed. A run folder that exists is resumed, so a reproduction that was cut off can be started again.
+`experiments/tables.py` prints the tables.
 """
 
 import argparse
@@ -25,6 +26,20 @@ from jaxskills.evaluate import FINE_SUBSTEPS
 RESULTS = Path(__file__).parent / "results"
 _CURVE = 40  # points kept of a learning curve
 _COLUMNS = ("samples", "wall_s", "survival_s", "success_rate", "fine_success_rate")
+# Of a family, besides.
+_FAMILY_COLUMNS = (
+    *(
+        "episodes",
+        "explored",
+        "elites",
+        "fitness",
+        "task_error",
+        "success",
+        "base_learnt",
+        "refining",
+    ),
+    *("marginal", "rate_around", "rate_inside"),
+)
 
 
 def reproduce(skill: str, seed: int, run: Path, options: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -54,10 +69,12 @@ def reproduce(skill: str, seed: int, run: Path, options: tuple[str, ...] = ()) -
         "command_s": seconds,
         **provenance.describe(RESULTS.parent),
     }
+    episodes = [] if "explored" in last else ["--episodes", "64"]
     for name, rate in (("evaluate", []), ("evaluate_600hz", ["--substeps", str(FINE_SUBSTEPS)])):
-        answer = jaxskills("evaluate", str(run), "--episodes", "64", "--json", *rate)
+        answer = jaxskills("evaluate", str(run), *episodes, "--json", *rate)
         record[name] = json.loads(answer) if answer else None
-    record["curve"] = [{k: row[k] for k in _COLUMNS if k in row} for row in thinned(rows)]
+    columns = (*_COLUMNS, *_FAMILY_COLUMNS)
+    record["curve"] = [{k: row[k] for k in columns if k in row} for row in thinned(rows)]
     return record
 
 
@@ -68,7 +85,7 @@ def train(options: list[str]) -> tuple[int, float, float | None]:
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr
         for line in process.stderr:
-            if first is None and " survival " in line:
+            if first is None and " samples (" in line:
                 first = round(time.monotonic() - begin, 1)
             print(line, end="", file=sys.stderr, flush=True)
     return process.returncode, round(time.monotonic() - begin, 1), first

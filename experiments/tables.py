@@ -13,6 +13,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import family_tables
 from compare import COMPARISONS
 
 RESULTS = Path(__file__).parent / "results"
@@ -123,7 +124,14 @@ def _measured(record: dict[str, Any]) -> list[str]:
 def trainings() -> str:
     """Returns the tables of trainings and of speed."""
     benchmarks = [json.loads((BENCHMARKS / f"{n}.json").read_text()) for n in ("physics", "train")]
-    return f"{table(records(RESULTS))}\n\n{speed(*benchmarks)}"
+    found = [record for record in records(RESULTS) if not family_tables.is_family(record)]
+    return f"{table(found)}\n\n{speed(*benchmarks)}"
+
+
+def families() -> str:
+    """Returns the table of families of skills."""
+    found = [record for record in records(RESULTS) if family_tables.is_family(record)]
+    return family_tables.table(found) if found else "None yet."
 
 
 def comparisons() -> str:
@@ -133,11 +141,13 @@ def comparisons() -> str:
         paths = {label: RESULTS / name / f"{label}.json" for label in labels}
         cases = {k: json.loads(path.read_text()) for k, path in paths.items() if path.is_file()}
         if cases:
-            tables.append(f"**{name}**\n\n{comparison(cases)}")
+            of_families = all(map(family_tables.is_family, cases.values()))
+            made = family_tables.comparison(cases) if of_families else comparison(cases)
+            tables.append(f"**{name}**\n\n{made}")
     return "\n\n".join(tables) or "None yet."
 
 
-PAGES = {"trainings": trainings, "comparisons": comparisons}
+PAGES = {"trainings": trainings, "families": families, "comparisons": comparisons}
 
 
 def main() -> None:

@@ -3,13 +3,14 @@
 
 import importlib.util
 import json
+import math
 from pathlib import Path
 from types import ModuleType
 
 import jax
 import pytest
 
-from jaxskills import cli, physics, provenance, trainer
+from jaxskills import cli, clip, families, physics, provenance, recipes, trainer
 
 ROOT = Path(__file__).parents[1]
 
@@ -57,8 +58,10 @@ def test_records_come_in_order(tmp_path: Path):
 @pytest.mark.parametrize("readme", ["README.md", "experiments/README.md"])
 def test_the_readme_shows_the_records(readme: str):
     tables = script("tables")
-    block = tables.BLOCK.search((ROOT / readme).read_text())
-    assert block and tables.PAGES[block[2]]() in block[0]
+    blocks = list(tables.BLOCK.finditer((ROOT / readme).read_text()))
+    assert blocks
+    for block in blocks:
+        assert tables.PAGES[block[2]]() in block[0]
 
 
 def test_a_comparison_table():
@@ -78,6 +81,90 @@ def test_a_comparison_table():
     assert lines[3] == "| like | 1.23 M | 2.00 M | 2 | 98% of 64 | 19.5 s | 0.88 | 61.2 | 51.2 |"
 
 
+FAMILY = RECORD | {
+    "skill": "pivot_family",
+    "seed": 0,
+    "curve": [
+        {"samples": 1, "episodes": 20_000, "explored": 0.5, "success": 0.9},
+        {"samples": 2, "episodes": 46_200, "explored": 0.93, "success": 0.9},
+    ],
+    "evaluate": {
+        "success_rate": 0.98,
+        "episodes": 50,
+        "errors": {
+            "rotation": {"mean": 0.0312, "p95": 0.08, "relative": True},
+            "angle": {"mean": 0.0312, "p95": 0.08, "relative": False},
+        },
+        "explored_ranges": {"rotation": [0.725, 1.3], "angle": None},
+    },
+}
+
+
+def test_a_row_of_the_table_of_families():
+    tables = script("family_tables")
+    assert tables.is_family(FAMILY) and not tables.is_family(RECORD)
+    assert tables.row(FAMILY) == (
+        "| pivot | 0 | 0.046 M | 0.120 M | 0.93 | 1.00 | 98% of 50 | failed"
+        " | rotation 3.1%, angle 0.03 | 2 |"
+    )
+    assert tables.table([FAMILY]).splitlines()[1].count("---") == 10
+
+
+def test_a_comparison_of_families():
+    tables = script("family_tables")
+    failed = FAMILY | {"evaluate": None, "curve": FAMILY["curve"][:1]}
+    lines = tables.comparison({"A1": failed, "A3": FAMILY}).splitlines()
+    assert lines[0].endswith("| explored angle | explored rotation | minutes |")
+    assert lines[2] == "| A1 | 0.020 M | 0.50 | never | failed |  | nothing | nothing | 2 |"
+    assert lines[3] == (
+        "| A3 | 0.046 M | 0.93 | 0.046 M | 98% of 50 | rotation 3.1%, angle 0.03"
+        " | nothing | 0.72 to 1.30 | 2 |"
+    )
+
+
+def test_families_have_a_table_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    tables = script("tables")
+    monkeypatch.setattr(tables, "RESULTS", tmp_path)
+    for record in (RECORD, FAMILY):
+        path = tmp_path / f"{record['skill']}-{record['seed']}.json"
+        path.write_text(json.dumps(record))
+    assert "pivot" not in tables.trainings() and "| walk |" in tables.trainings()
+    assert "| pivot |" in tables.families() and "walk" not in tables.families()
+    for label in ("A1", "A3"):
+        (tmp_path / "jump_ablation").mkdir(exist_ok=True)
+        (tmp_path / "jump_ablation" / f"{label}.json").write_text(json.dumps(FAMILY))
+    assert "90 % explored after" in tables.comparisons()
+
+
+def test_the_families_of_the_paper():
+    """Every row of FS Table 1 has its most samples; a recipe that is there is a family."""
+    paper, most = script("family_tables").PAPER, script("fs_table1").SAMPLES
+    assert set(paper) == {f"{skill}_family" for skill in most} and len(paper) == 13
+    there = [name for name in paper if name in recipes.names()]
+    assert "pivot_family" in there
+    for name in there:
+        assert recipes.task(name).free
+
+
+def test_steps_of_an_episode():
+    """The pivot lasts as long as its clip, then its last pose is held for half a second."""
+    seconds = clip.load("pivot").duration
+    assert script("fs_table1").steps("pivot_family") == math.ceil(30 * seconds - 1e-6) + 15
+
+
+def test_the_ablations_are_what_they_are_called():
+    cases = script("compare").COMPARISONS["jump_ablation"]
+    found = {}
+    for label, case in cases.items():
+        _, config = cli.parse(["train", case.skill, "--out", "nowhere", *case.options])
+        found[label] = config.family.vary, config.env.time_warp
+        assert config.family.curriculum.method == "fixed_alternation"
+    assert found == {"A1": (False, False), "A2": (True, False), "A3": (True, True)}
+    task = recipes.task("jump_gravity_family")
+    assert [p.name for p in task.free] == ["gravity"]
+    assert {p.name for p in task.parameters if p.fixed} == {"energy", "foot_contact"}
+
+
 def test_each_comparison_can_be_trained():
     """Its skills are recipes, and its options are options of `train`."""
     for name, cases in script("compare").COMPARISONS.items():
@@ -85,7 +172,7 @@ def test_each_comparison_can_be_trained():
             command = ["train", case.skill, "--out", "nowhere", *case.options]
             _, config = cli.parse(command)
             assert config.samples < 50e6, (name, label)
-            trainer.validate(config)
+            (families if config.task else trainer).validate(config)
 
 
 def test_deepmimic_is_imitation_until_a_fall_without_anything_of_ours():

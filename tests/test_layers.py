@@ -32,9 +32,11 @@ explore.starts explore.evolution explore.adaptive explore.refine explore.fitness
 explore.parameterization explore.marginal explore.sampling explore.curriculum explore.family
 explore.episodes explore
 
-trainer recipes families checkpoint evaluate style_measures train
-render.opengl render.stage render.take render.video render.strip render
-plot.sheet plot.states plot.training plot.starts plot playback provenance
+trainer recipes families checkpoint runs evaluate perform evaluate_family controller
+style_measures train
+render.opengl render.stage render.take render.video render.several render.strip render
+plot.sheet plot.states plot.training plot.starts plot.family plot
+task_values playback playback_family provenance
 
 progress arguments commands cli __main__
 """.split()

@@ -26,6 +26,29 @@ def test_line_of_adaptive_bounds():
     assert progress.line("walk", 20_000_000, metrics, 0.0) == expected
 
 
+FAMILY = {
+    "samples": 967_680,
+    "survival_s": 153.6,
+    "episodes": 22_812,
+    "base_learnt": True,
+    "refining": False,
+    "explored": 0.414,
+    "success": 0.9968,
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "phase"),
+    [({}, "exploring"), ({"refining": True}, "refining"), ({"base_learnt": False}, "base")],
+)
+def test_line_of_a_family(changes: dict, phase: str):
+    line = progress.line("pivot", 2_000_000, FAMILY | changes, 0.0)
+    assert line == (
+        f"pivot  968k of 2M samples (48%)  22.8k episodes  {phase}  explored 41%  success 100%"
+        "  0/s  ? left"
+    )
+
+
 def _report_five(every: float) -> None:
     with progress.live("walk", 10, every=every) as report:
         for samples in range(1, 6):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Films: what a file holds is read back, and pixels are compared where a figure must be."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from jaxskills import character as character_lib
 from jaxskills import render
 from jaxskills.character import Character
 from jaxskills.errors import UserError
-from jaxskills.render import opengl, stage, take, video
+from jaxskills.render import opengl, several, stage, take, video
 
 pytestmark = pytest.mark.timeout(100)
 
@@ -126,6 +127,54 @@ def test_ghost_is_beside_or_exactly_there(gl, walker, walk):
     assert _green_columns(over).mean() == pytest.approx(figure.mean(), abs=5)
     # Beside it the ghost stands in the other half, and the simulation makes room.
     assert _green_columns(beside).mean() > _green_columns(over).mean() + 10
+
+
+def _cells(walker: Character, walk: np.ndarray) -> list[list[render.Cell]]:
+    """Three performances in two rows; the second one is shorter, the third one has a red leg."""
+    spec = mujoco.MjSpec.from_file(walker.source)
+    for geom in spec.body("left_leg").geoms:
+        geom.rgba = np.array([1.0, 0.0, 0.0, 1.0])
+    other = dataclasses.replace(walker, model=spec.compile())
+    first = render.Cell(walker, walk, walk, "slow")
+    second = render.Cell(walker, walk[:4], walk[:4], "fast")
+    return [[first, second], [render.Cell(other, walk, None, "red")]]
+
+
+def test_a_grid_shows_all_at_a_time(gl, walker, walk, tmp_path):
+    path = render.grid(_cells(walker, walk), tmp_path / "grid.mp4", size=SMALL)
+    info, frames = _decode(path)
+    assert info["size"] == (2 * SMALL[0], 2 * SMALL[1]) and len(frames) == FRAMES
+    last = [frame.astype(int) for frame in (frames[4], frames[-1])]
+    left, right = np.s_[: SMALL[1], : SMALL[0]], np.s_[: SMALL[1], SMALL[0] :]
+    assert np.abs(last[0][left] - last[1][left]).max() > 50
+    assert np.abs(last[0][right] - last[1][right]).max() < 30  # it waits; codecs are not exact
+    below = frames[0][SMALL[1] :]
+    assert _green(below) == 0 and below[:, SMALL[0] :].min() > 240  # no fourth one
+    assert _green(frames[0][left]) > 20 and _green(frames[0][right]) > 20
+
+
+def test_a_grid_draws_each_with_its_own_model(gl, walker, walk):
+    takes = several.takes(_cells(walker, walk), 30.0)
+    picture = np.array(next(several.frames(takes, (160, 120))), int)
+    red = (picture[..., 0] > picture[..., 1] + 60) & (picture[..., 0] > picture[..., 2] + 60)
+    assert red[120:, :160].sum() > 20 and not red[:120].any()
+
+
+def test_a_grid_of_strips(gl, walker, walk, tmp_path):
+    options = {"size": (303, 0), "panels": 3}
+    path = render.grid(_cells(walker, walk), tmp_path / "grid.png", **options)
+    strip = np.array(Image.open(path), int)
+    tall = (strip.shape[0] - 2 * 3) // 3
+    rows = [strip[i * (tall + 3) : i * (tall + 3) + tall] for i in range(3)]
+    assert strip.shape[0] == 3 * tall + 2 * 3
+    assert _green(rows[0]) > 20 and _green(rows[1]) > 20 and _green(rows[2]) == 0
+
+
+def test_a_grid_of_nothing(walker, tmp_path):
+    with pytest.raises(UserError, match="a grid of no performances"):
+        render.grid([[]], tmp_path / "grid.mp4")
+    with pytest.raises(UserError, match="unknown film format '.avi'"):
+        render.grid([[]], tmp_path / "grid.avi")
 
 
 def test_strip_has_its_panels_and_the_character_moves(gl, walker, walk, tmp_path):

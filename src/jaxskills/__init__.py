@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jaxskills.character import Character as Character
     from jaxskills.clip.data import Clip as Clip
+    from jaxskills.controller import family_controller as family_controller
     from jaxskills.env.bounds import BoundsConfig as BoundsConfig
     from jaxskills.env.core import EnvConfig as EnvConfig
     from jaxskills.env.core import Environment as Environment
+    from jaxskills.env.task import Parameter as Parameter
+    from jaxskills.env.task import TaskSpec as TaskSpec
     from jaxskills.errors import UserError as UserError
     from jaxskills.evaluate import EvaluateConfig as EvaluateConfig
     from jaxskills.evaluate import Trace as Trace
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from jaxskills.motion import MotionConfig as MotionConfig
     from jaxskills.recipes import Recipe as Recipe
     from jaxskills.retarget.mapping import Mapping as Mapping
+    from jaxskills.runs import open_run as open_run
     from jaxskills.trainer import TrainConfig as TrainConfig
     from jaxskills.trainer import Trainer as Trainer
     from jaxskills.trainer import TrainState as TrainState
@@ -40,13 +44,17 @@ _MODULE = {
     "MotionConfig": "motion",
     "NetworkConfig": "learn.networks",
     "PPOConfig": "learn.ppo",
+    "Parameter": "env.task",
     "Recipe": "recipes",
     "StartsConfig": "explore.starts",
+    "TaskSpec": "env.task",
     "Trace": "evaluate",
     "TrainConfig": "trainer",
     "TrainState": "trainer",
     "Trainer": "trainer",
     "UserError": "errors",
+    "family_controller": "controller",
+    "open_run": "runs",
 }
 
 __all__ = ["__version__", *_MODULE]  # pyright: ignore[reportUnsupportedDunderAll]

@@ -34,18 +34,21 @@ class Train:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """Measure how long a trained controller stays up."""
+    """Measure how long a trained controller stays up, or how well a family does what it is asked.
+
+    A family performs its motion once for each of some new task parameters.
+    """
 
     run: Run
     """Folder of a run."""
-    seconds: float = 20.0
-    """Length of an episode in s."""
-    episodes: int = 32
-    """Number of episodes."""
+    seconds: float | None = None
+    """Length of an episode in s. None: 20; of a family one performance, always."""
+    episodes: int | None = None
+    """Number of episodes. None: 32; of a family 50, each of another task parameter."""
     substeps: int | None = None
     """Physics steps per control step of 1/30 s (20: 600 Hz). None: as in the training."""
     seed: int = 1
-    """Seed of the phases at which episodes start."""
+    """Seed of the phases at which episodes start, or of the task parameters."""
     style_clip: str | None = None
     """A clip, by name or file: also say how far from its style. None: the one the run wanted."""
     backend: Backend = "auto"
@@ -64,13 +67,19 @@ class Render:
     """File to write: .mp4 for a film, .png for a film strip."""
     seconds: float = 10.0
     """Length of the film in s; it ends shortly after a fall."""
+    task: Annotated[tuple[str, ...], conf.arg(metavar="NAME=VALUE,...")] = ()
+    """Of a family: what to perform, as in --task energy=1.2 gravity=0.5. Several values, as in
+    rotation=0.8,1.6,2.4, of one or two parameters give a grid. Not named: as in the reference."""
     backend: Backend = "auto"
     """Physics engine; auto takes the best one for this machine, whatever the run learnt on."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plot:
-    """Plot a training: learning curve, bound margins over phase, what ended the episodes."""
+    """Plot a training: learning curve, bound margins over phase, what ended the episodes.
+
+    Of a family: the curriculum, what of the task space is explored, what new parameters give.
+    """
 
     run: Run
     """Folder of a run."""

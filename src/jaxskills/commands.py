@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +17,27 @@ from jaxskills import (
     check,
     checkpoint,
     clip,
+    evaluate_family,
     paths,
     physics,
     playback,
+    playback_family,
     plot,
     progress,
     recipes,
     render,
+    runs,
     style_measures,
 )
 from jaxskills import character as character_lib
 from jaxskills import evaluate as evaluate_lib
+from jaxskills import perform as perform_lib
 from jaxskills import retarget as retarget_lib
 from jaxskills import train as train_lib
-from jaxskills import trainer as trainer_lib
 from jaxskills.env import bounds_file
 from jaxskills.env.bounds import BoundsConfig
 from jaxskills.errors import UserError, unknown
+from jaxskills.plot import family as family_plot
 from jaxskills.recipes import Recipe
 from jaxskills.trainer import TrainConfig, Trainer, TrainState
 
@@ -122,21 +126,36 @@ def train(command: arguments.Train, config: TrainConfig) -> Answer:
         text = f"interrupted: {last['samples']} samples are saved in '{run}', --resume goes on"
         return Answer(text, last, interrupted=True)
     lines = [f"{name}: {last['why']} after {last['samples']} samples, {last['wall_s']:.0f} s"]
+    film_into = _filmed(made, state)
     for path in (run / f"{name}.mp4", run / f"{name}.png"):
         try:
-            lines.append(f"wrote {playback.film(made, state, path, seconds=10.0)}")
+            lines.append(f"wrote {film_into(path)}")
         except UserError as error:  # nothing to draw with: the controller is there all the same
             lines.append(f"no {path.name}: {error}")
     return Answer("\n".join(lines), last)
+
+
+def _filmed(made: Trainer, state: TrainState) -> Callable[[Path], Path]:
+    """Returns what films a run into a file, of a family a grid over its task parameters."""
+    if made.task is None:
+        return lambda path: playback.film(made, state, path, seconds=10.0)
+    wanted = playback_family.wanted(made, state, None)
+    cells = playback_family.cells(made, state, wanted)
+    return lambda path: playback_family.film(cells, path)
 
 
 def evaluate(command: arguments.Evaluate) -> Answer:
     """Measures the controller of a run."""
     if command.style_clip is not None:
         clip.find(command.style_clip)  # a mistake is said at once
-    made, state = _open(command.run, command.backend)
+    made, state = runs.open_run(command.run, command.backend)
+    if made.task is not None:
+        return _evaluate_family(command, made, state)
     config = evaluate_lib.EvaluateConfig(
-        command.seconds, command.episodes, command.substeps, command.seed
+        seconds=20.0 if command.seconds is None else command.seconds,
+        episodes=32 if command.episodes is None else command.episodes,
+        substeps=command.substeps,
+        seed=command.seed,
     )
     trace = playback.play(made, state, config)
     data = {
@@ -151,21 +170,55 @@ def evaluate(command: arguments.Evaluate) -> Answer:
     return Answer("\n".join(lines), data)
 
 
+def _evaluate_family(command: arguments.Evaluate, made: Trainer, state: TrainState) -> Answer:
+    for name, value in (("seconds", command.seconds), ("style-clip", command.style_clip)):
+        if value is not None:
+            raise UserError(
+                f"--{name} is {value}: this run is of a family, which performs its motion once for"
+                f" each task parameter: leave --{name} out"
+            )
+    config = evaluate_family.FamilyEvaluateConfig(substeps=command.substeps, seed=command.seed)
+    if command.episodes is not None:
+        config = dataclasses.replace(config, episodes=command.episodes)
+    a = evaluate_family.parameters(made, config)
+    done = perform_lib.perform(made, state, a, config.substeps)
+    data = {
+        **evaluate_family.summary(made, state, done),
+        "samples": int(state.samples),
+        "seed": config.seed,
+        "substeps": config.substeps or made.config.env.substeps,
+    }
+    return Answer("\n".join(evaluate_family.lines(data)), data)
+
+
 def film(command: arguments.Render) -> Answer:
     """Films the controller of a run beside its reference."""
     _admit(command.out, render.FORMATS)
-    made, state = _open(command.run, command.backend)
-    path = playback.film(made, state, command.out, command.seconds)
+    made, state = runs.open_run(command.run, command.backend)
+    if made.task is not None:
+        wanted = playback_family.wanted(made, state, command.task)
+        cells = playback_family.cells(made, state, wanted, command.seconds)
+        path = playback_family.film(cells, command.out)
+    elif command.task:
+        raise UserError(f"--task is {command.task[0]}: this run is of one skill: leave it out")
+    else:
+        path = playback.film(made, state, command.out, command.seconds)
     return Answer(f"wrote {path}", {"out": str(path)})
 
 
 def picture(command: arguments.Plot) -> Answer:
     """Plots the training of a run, and what its controller does."""
     _admit(command.out, plot.FORMATS)
-    made, state = _open(command.run, "auto")
+    made, state = runs.open_run(command.run)
     metrics = _metrics(command.run / "metrics.jsonl")
-    trace = playback.play(made, state, evaluate_lib.EvaluateConfig())
     title = f"{Path(made.config.clip).stem} on {made.character.name}"
+    if made.task is not None:
+        a = evaluate_family.parameters(made, evaluate_family.FamilyEvaluateConfig())
+        done = perform_lib.perform(made, state, a)
+        seen = playback_family.explored(made, state), playback_family.asked(made, done)
+        path = family_plot.figure(command.out, f"family of {title}", metrics, *seen)
+        return Answer(f"wrote {path}", {"out": str(path)})
+    trace = playback.play(made, state, evaluate_lib.EvaluateConfig())
     path = plot.figure(
         command.out, title, metrics, playback.played(made, trace), playback.evolved(made, state)
     )
@@ -178,13 +231,6 @@ def bounds(command: arguments.Bounds) -> Answer:
     character = character_lib.load(command.character)
     bounds_file.write(command.out, character, BoundsConfig())
     return Answer(f"wrote {command.out}", {"out": str(command.out)})
-
-
-def _open(run: Path, backend: str) -> tuple[Trainer, TrainState]:
-    """Returns a trained run, on a backend of this machine instead of the one it learnt on."""
-    config: Any = dataclasses.replace(checkpoint.read_config(run), backend=backend)
-    made = trainer_lib.make(config)
-    return made, checkpoint.restore(run, made)
 
 
 @contextlib.contextmanager

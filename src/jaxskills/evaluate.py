@@ -52,6 +52,7 @@ class Trace:
     over: jax.Array  # [T, E] bool, the motion has ended
     com: jax.Array  # [T, E, 3] m
     torque: jax.Array  # [T, E, nu] N m
+    known: jax.Array | None = None  # [T, E, M, 2] of the measures of a family's task
 
 
 def make(trainer: Trainer, config: EvaluateConfig) -> Callable[[TrainState, jax.Array], Trace]:
@@ -89,8 +90,18 @@ def make(trainer: Trainer, config: EvaluateConfig) -> Callable[[TrainState, jax.
     return evaluate
 
 
-def run(env: Environment, nets: Networks, state: TrainState, phase: jax.Array, steps: int) -> Trace:
-    """Returns the trace of E episodes that begin on the reference at `phase [E]`."""
+def run(
+    env: Environment,
+    nets: Networks,
+    state: TrainState,
+    phase: jax.Array,
+    steps: int,
+    variant: jax.Array | int = 0,
+) -> Trace:
+    """Returns the trace of E episodes that begin on the reference at `phase [E]`.
+
+    They are of the variants `[E]`, or all of one.
+    """
 
     def advance(now: rollout.Fresh, _: None) -> tuple[rollout.Fresh, Trace]:
         mean = nets.mean(state.learner.policy, normalize.apply(state.normalizer, now.obs))
@@ -108,10 +119,11 @@ def run(env: Environment, nets: Networks, state: TrainState, phase: jax.Array, s
             over,
             report.com,
             report.torque,
+            states.known,
         )
         return rollout.Fresh(states, outcome.obs), seen
 
-    _, trace = jax.lax.scan(advance, rollout.begin(env, phase), None, length=steps)
+    _, trace = jax.lax.scan(advance, rollout.begin(env, phase, variant), None, length=steps)
     return trace
 
 

@@ -140,7 +140,9 @@ def _family(config: TrainConfig, spec: TaskSpec) -> Trainer:
         return dataclasses.replace(state, updates=counts[0], samples=counts[1]), metrics | seen
 
     samples = config.envs * config.horizon * chunk_count(config, own.shown)
-    return Trainer(config, own.character, own.shown, plain, nets, init, update, samples, world)
+    return Trainer(
+        config, own.character, own.shown, plain, nets, init, update, samples, world, spec
+    )
 
 
 @struct.dataclass

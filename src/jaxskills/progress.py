@@ -65,7 +65,9 @@ def line(name: str, total: int, metrics: Mapping[str, Any], pace: float) -> str:
 
     `pace` in samples per second; see `live` for the others. With `worst_bound` and `worst_phase` it
     also says what ends most episodes, and where; with `bound_scale` how wide adaptive bounds are;
-    with `fine` that physics steps are finer now.
+    with `fine` that physics steps are finer now. Of a family it says, instead of the survival,
+    `23k episodes  exploring  explored 41%  success 93%`; the phase is `base` as long as only the
+    reference itself is learnt.
     """
     samples = metrics["samples"]
     ends = ""
@@ -76,9 +78,21 @@ def line(name: str, total: int, metrics: Mapping[str, Any], pace: float) -> str:
     if "bound_scale" in metrics:
         ends += f"  bounds x{metrics['bound_scale']:.2f}"
     left = _clock((total - samples) / pace) if pace > 0 else "?"
+    how = f"survival {metrics['survival_s']:.1f} s"
+    if "explored" in metrics:
+        how = _family(metrics)
     return (
         f"{name}  {_short(samples)} of {_short(total)} samples ({samples / total:.0%})"
-        f"  survival {metrics['survival_s']:.1f} s{ends}  {_short(pace)}/s  {left} left"
+        f"  {how}{ends}  {_short(pace)}/s  {left} left"
+    )
+
+
+def _family(metrics: Mapping[str, Any]) -> str:
+    phase = "refining" if metrics["refining"] else "exploring"
+    phase = phase if metrics["base_learnt"] else "base"
+    return (
+        f"{_short(metrics['episodes'])} episodes  {phase}  explored {metrics['explored']:.0%}"
+        f"  success {metrics['success']:.0%}"
     )
 
 

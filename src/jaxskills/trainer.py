@@ -23,6 +23,7 @@ from jaxskills import pose, retarget
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import core, gram, variants
+from jaxskills.env.task import TaskSpec
 from jaxskills.errors import UserError
 from jaxskills.explore import adaptive as adaptive_lib
 from jaxskills.explore import evolution as evolution_lib
@@ -93,6 +94,7 @@ class Trainer(NamedTuple):
     samples: int  # transitions of an update
     # On the host, before each update: (state) -> the bodies and physics that it asks for.
     world: Callable[[TrainState], Any] | None = None
+    task: TaskSpec | None = None  # what a family varies in; None: one skill
 
 
 def reference(config: TrainConfig, character: Character) -> Motion:

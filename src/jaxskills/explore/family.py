@@ -47,6 +47,9 @@ class FamilyConfig:
     """How a family is learnt."""
 
     episodes: float = 2.5  # motions that each environment has time for in an update
+    # Off: the motion to imitate is the reference itself, whatever the task, without a
+    # parameterisation; A1 of FS 7.2 with `env.time_warp` off too.
+    vary: bool = True
     late: float = 0.2  # share of the starts that lie somewhere in the motion, where the task allows
     # The reference itself is learnt when that share of the episodes get through it, and the reward
     # has not grown by so much for some updates.
@@ -200,10 +203,26 @@ def _ask(
         config.curriculum, family.curriculum, density, value, renew_key
     )
     a, region = curriculum_lib.draw(config.curriculum, curriculum, density, draw_key)
-    x = parameterization_lib.draw(
-        config.parameterization, family.network, family.elites, a, motion_key
-    )
+    if config.vary:
+        x = parameterization_lib.draw(
+            config.parameterization, family.network, family.elites, a, motion_key
+        )
+    else:
+        x = jnp.zeros_like(family.asked.x)
     return dataclasses.replace(family, curriculum=curriculum, asked=Asked(a, region, x))
+
+
+def best(config: FamilyConfig, family: Family, a: jax.Array) -> jax.Array:
+    """Returns the motions `[B, M]` that are known best for task parameters `a [B, P]`.
+
+    Those of the network once it is trusted, until then of the proxy (FS 5.3), without chance; the
+    reference itself as long as nothing else was asked for.
+    """
+    how, network, elites = config.parameterization, family.network, family.elites
+    likely = elites_lib.proxy(elites, a, how.neighbours, how.sigma)
+    sure = parameterization_lib.trusted(how, network)
+    x = jnp.where(sure, parameterization_lib.apply(network, a), likely)
+    return jnp.where(family.base.learnt & config.vary, x, 0.0)
 
 
 def _base(config: FamilyConfig, base: Base, results: Results) -> Base:

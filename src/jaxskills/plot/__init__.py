@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxskills.errors import unknown
 from jaxskills.plot import starts
+from jaxskills.plot.sheet import FORMATS, admitted
 from jaxskills.plot.starts import Evolved
 from jaxskills.plot.states import com_height, endings, margins, regions, regions_height
 from jaxskills.plot.training import causes, learning_curve, training_endings
@@ -32,8 +32,6 @@ __all__ = [
     "regions",
     "training_endings",
 ]
-
-FORMATS = (".png", ".pdf", ".svg")
 
 _ROW = 3.4  # inches
 _TITLE = 0.6
@@ -71,9 +69,7 @@ def figure(
     Raises:
       UserError: another suffix, or metrics without lines or without what each line must have.
     """
-    path = Path(path)
-    if path.suffix.lower() not in FORMATS:
-        raise unknown("picture format", path.suffix, FORMATS)
+    path = admitted(path)
     heights = [_ROW]
     if played is not None:
         heights += [_ROW, _ROW, regions_height(len(played.margins))]

@@ -2,9 +2,14 @@
 """What all pictures share: colours, labels, legends, and which rows are worth their place."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+
+from jaxskills.errors import unknown
+
+FORMATS = (".png", ".pdf", ".svg")
 
 BLUE, GREEN, RED, ORANGE, GREY = "#3568a5", "#2a8f52", "#c23b33", "#d9822b", "#8a9099"
 # Told apart in print and by the colour-blind; more causes than this are shown as one.
@@ -12,6 +17,18 @@ CYCLE = (BLUE, ORANGE, "#5aa897", "#b0507f", "#7c64b5", "#a8923a")
 
 BINS = 40  # of phase
 PHASE = "phase (share of a cycle)"
+
+
+def admitted(path: str | Path) -> Path:
+    """Returns the path of a picture.
+
+    Raises:
+      UserError: its suffix is none of `FORMATS`.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise unknown("picture format", path.suffix, FORMATS)
+    return path
 
 
 def finish(axes: Axes, title: str, x: str, y: str) -> None:

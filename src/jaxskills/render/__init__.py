@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Films and film strips from stored poses: the simulation, and the reference as a green ghost."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from jaxskills.character import Character
 from jaxskills.errors import UserError, unknown
-from jaxskills.render import strip, video
+from jaxskills.render import several, strip, video
+from jaxskills.render.several import Cell
 from jaxskills.render.take import checked
 
-__all__ = ["FORMATS", "film"]
+__all__ = ["FORMATS", "Cell", "film", "grid"]
 
 # Suffix to width and height in pixels; of a strip only the width is given.
 FORMATS = {".mp4": (800, 450), ".gif": (480, 270), ".png": (1800, 0)}
@@ -54,10 +56,7 @@ def film(
     Raises:
       UserError: another suffix, arrays of another shape, nothing to render with.
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in FORMATS:
-        raise unknown("film format", path.suffix, FORMATS)
+    path, suffix = _admitted(path)
     width, height = size or FORMATS[suffix]
     if width < 16 or panels < 1 or (height < 16 and suffix != ".png"):
         raise UserError(
@@ -67,8 +66,65 @@ def film(
     path.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".png":
         seconds = 2 * cycle if cycle else _STRIP_SECONDS
-        strip.draw(take, width, seconds, panels, overlay).save(path)
+        strip.draw([take], width, seconds, panels, overlay).save(path)
     else:
-        write = video.write_mp4 if suffix == ".mp4" else video.write_gif
-        write(path, take, (width - width % 2, height - height % 2), overlay)
+        step = video.gif_step(fps) if suffix == ".gif" else 1
+        even = width - width % 2, height - height % 2
+        _write(path, video.frames(take, even, overlay, step), even, fps / step)
     return path
+
+
+def grid(
+    cells: Sequence[Sequence[Cell]],
+    path: str | Path,
+    *,
+    fps: float = 30.0,
+    size: tuple[int, int] | None = None,
+    panels: int = 12,
+) -> Path:
+    """Writes a film of several performances side by side, or their film strips one below the other.
+
+    All begin together; who ends sooner waits in its last pose. Every one is drawn as the character
+    that it is given with, so bodies and objects may differ. In a strip the ghost is drawn where the
+    reference is.
+
+    Args:
+      cells: rows, from left to right.
+      path: see `film`.
+      fps: poses per s.
+      size: width and height in pixels of one cell (of a whole strip), else as large as fits.
+      panels: pictures in a strip.
+
+    Raises:
+      UserError: as `film`, or no cells.
+    """
+    path, suffix = _admitted(path)
+    takes = several.takes(cells, fps)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if suffix == ".png":
+        flat = [take for row in takes for take in row]
+        width = (size or FORMATS[suffix])[0]
+        longest = max(len(take.qpos) for take in flat) / fps
+        strip.draw(flat, width, longest, panels, overlay=True).save(path)
+        return path
+    columns = max(len(row) for row in takes)
+    cell = size or several.cell_size(columns, FORMATS[suffix][0])
+    step = video.gif_step(fps) if suffix == ".gif" else 1
+    whole = columns * cell[0], len(takes) * cell[1]
+    _write(path, several.frames(takes, cell, step), whole, fps / step)
+    return path
+
+
+def _admitted(path: str | Path) -> tuple[Path, str]:
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise unknown("film format", path.suffix, FORMATS)
+    return path, suffix
+
+
+def _write(path: Path, pictures: Iterator[Image.Image], size: tuple[int, int], fps: float) -> None:
+    if path.suffix.lower() == ".gif":
+        video.write_gif(path, pictures, fps)
+    else:
+        video.write_mp4(path, pictures, size, fps)

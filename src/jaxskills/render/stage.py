@@ -65,6 +65,7 @@ class Stage:
     floor: float  # m
     scene: mujoco.MjvScene
     context: mujoco.MjrContext
+    gl: Any  # the OpenGL context, which may be one of several
 
 
 @contextlib.contextmanager
@@ -105,7 +106,7 @@ def opened(
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
         scene = mujoco.MjvScene(solid, maxgeom=2 * model.ngeom + _MAX_TILES + 1000)
         both = mujoco.MjData(solid), mujoco.MjData(ghost)
-        yield Stage(*both, lens, width, height, body, floor, scene, context)
+        yield Stage(*both, lens, width, height, body, floor, scene, context, gl)
 
 
 def picture(
@@ -119,6 +120,7 @@ def picture(
       qpos: [nq] pose of the solid character; None leaves it out.
       ghost: [nq] pose of the translucent one; None leaves it out.
     """
+    stage.gl.make_current()
     scene = stage.scene
     scene.ngeom = 0
     for data, pose in ((stage.solid, qpos), (stage.ghost, ghost)):

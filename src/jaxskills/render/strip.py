@@ -2,8 +2,9 @@
 """A film strip: moments of a motion side by side in one wide image, seen from the right."""
 
 import dataclasses
+import itertools
+from collections.abc import Sequence
 
-import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -21,6 +22,7 @@ _AZIMUTH, _ELEVATION, _FOVY = 105.0, -8.0, 12.0
 _ASIDE, _BELOW = 0.08, 0.1  # free space at the sides and below, in statures
 _TEXT = 0.11  # size of the letters, of the width of a panel
 _LEADING = 1.3  # between two lines, in letters
+_GREEN = "green: reference"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,38 +33,43 @@ class _Row:
     ghost: np.ndarray | None  # [N, nq]
     centre: np.ndarray  # [N, 3] m
     name: str
+    take: Take
 
 
-def draw(take: Take, width: int, seconds: float, panels: int, overlay: bool) -> Image.Image:
+def draw(
+    takes: Sequence[Take], width: int, seconds: float, panels: int, overlay: bool
+) -> Image.Image:
     """Returns the strip; its height follows from the motion.
 
     Args:
-      take: what is shown.
+      takes: what is shown, one below the other at the same times and the same size.
       width: of the strip in pixels, a few less where panels do not come out even.
-      seconds: time between the first and the last panel, less if the take is shorter.
-      panels: how many, fewer if the take has fewer poses.
+      seconds: time between the first and the last panel, less if all takes are shorter.
+      panels: how many, fewer if the longest take has fewer poses.
       overlay: draw the reference as a ghost in the row of the simulation, else in a row above.
     """
-    count = min(panels, len(take.qpos))
-    last = min(seconds * take.fps, len(take.qpos) - 1)
+    longest = max(takes, key=lambda take: len(take.qpos))
+    count = min(panels, len(longest.qpos))
+    last = min(seconds * longest.fps, len(longest.qpos) - 1)
     moments = np.round(np.linspace(0, last, count)).astype(int)
-    labels = [take.labels[i] for i in moments]
-    rows = _rows(take, moments, overlay)
-    lens = stage.Lens(float(np.degrees(take.heading)) + _AZIMUTH, _ELEVATION, 1.0, _FOVY)
-    aside, low, high = _extent(take.character.model, rows, lens)
-    aside += _ASIDE * take.body
-    low -= _BELOW * take.body
-    high += 2 * aside * _TEXT * (0.5 + _LEADING * (1 if take.reference is None else 2))
+    labels = [longest.labels[i] for i in moments]
+    rows = [row for take in takes for row in _rows(take, moments, overlay)]
+    lens = stage.Lens(float(np.degrees(takes[0].heading)) + _AZIMUTH, _ELEVATION, 1.0, _FOVY)
+    aside, low, high = _extent(rows, lens)
+    body = max(take.body for take in takes)
+    aside += _ASIDE * body
+    low -= _BELOW * body
+    high += 2 * aside * _TEXT * (0.5 + _LEADING * (2 if any(row.name for row in rows) else 1))
     lens = dataclasses.replace(lens, distance=(high - low) / 2 / np.tan(np.radians(_FOVY / 2)))
     wide = max((width - (count - 1) * _GAP) // count, 1)
     tall = round(wide * (high - low) / (2 * aside))
     strip = Image.new(
         "RGB", (count * (wide + _GAP) - _GAP, len(rows) * (tall + _GAP) - _GAP), _PAPER
     )
-    model, forward = take.character.model, take.character.forward
-    with stage.opened(model, forward, lens, _FINE * wide, _FINE * tall) as studio:
-        for down, row in enumerate(rows):
-            for i, label in enumerate(labels):
+    for take, group in itertools.groupby(enumerate(rows), key=lambda row: row[1].take):
+        model, forward = take.character.model, take.character.forward
+        with stage.opened(model, forward, lens, _FINE * wide, _FINE * tall) as studio:
+            for (down, row), (i, label) in itertools.product(group, enumerate(labels)):
                 point = np.array([*row.centre[i, :2], (low + high) / 2])
                 poses = (None if poses is None else poses[i] for poses in (row.solid, row.ghost))
                 panel = Image.fromarray(stage.picture(studio, point, *poses)).reduce(_FINE)
@@ -72,22 +79,26 @@ def draw(take: Take, width: int, seconds: float, panels: int, overlay: bool) -> 
 
 
 def _rows(take: Take, moments: np.ndarray, overlay: bool) -> list[_Row]:
+    moments = np.minimum(moments, len(take.qpos) - 1)  # who ends sooner waits in its last pose
     solid, centre = take.qpos[moments], lookat(take, take.qpos)[moments]
     if take.reference is None:
-        return [_Row(solid, None, centre, "")]
+        return [_Row(solid, None, centre, take.name, take)]
     ghost = take.reference[moments]
     if overlay:
-        return [_Row(solid, ghost, centre, "green: reference")]
+        return [_Row(solid, ghost, centre, take.name or _GREEN, take)]
     its_centre = lookat(take, take.reference)[moments]
-    return [_Row(None, ghost, its_centre, "reference"), _Row(solid, None, centre, "simulation")]
+    names = "reference", "simulation"
+    return [
+        _Row(None, ghost, its_centre, names[0], take),
+        _Row(solid, None, centre, names[1], take),
+    ]
 
 
-def _extent(
-    model: mujoco.MjModel, rows: list[_Row], lens: stage.Lens
-) -> tuple[float, float, float]:
+def _extent(rows: list[_Row], lens: stage.Lens) -> tuple[float, float, float]:
     """Returns in m how far the poses reach from the centre sideways, how low and how high."""
     aside, low, high = [0.0], [], []
     for row in rows:
+        model = row.take.character.model
         for poses in (row.solid, row.ghost):
             for pose, centre in zip([] if poses is None else poses, row.centre, strict=False):
                 across = np.array(stage.reach(model, pose, lens.right)) - centre @ lens.right
@@ -103,5 +114,5 @@ def _write(panel: Image.Image, label: str, name: str) -> None:
     font, margin = ImageFont.load_default(size), size / 2
     pen = ImageDraw.Draw(panel)
     pen.text((margin, margin), label, INK, font)
-    colour = INK if name == "simulation" else GREEN
+    colour = GREEN if name in ("reference", _GREEN) else INK
     pen.text((margin, margin + _LEADING * size), name, colour, font)

@@ -30,6 +30,7 @@ class Take:
     fps: float
     heading: float  # rad, direction of travel
     body: float  # m, stature of the character
+    name: str = ""  # of the take, where there are several
 
 
 def checked(

@@ -23,14 +23,16 @@ _AZIMUTH, _ELEVATION, _DISTANCE, _FOVY = 130.0, -10.0, 3.6, 30.0
 _BELOW_ROOT = 0.07  # statures; legs come nearer to the camera than heads
 
 
-def write_mp4(path: Path, take: Take, size: tuple[int, int], overlay: bool) -> None:
-    """Writes all poses at their speed.
+def write_mp4(
+    path: Path, pictures: Iterator[Image.Image], size: tuple[int, int], fps: float
+) -> None:
+    """Writes all pictures at their speed.
 
     Args:
       path: file to write.
-      take: what is filmed.
-      size: width and height in pixels, even numbers.
-      overlay: see `frames`.
+      pictures: as of `frames`.
+      size: their width and height in pixels, even numbers.
+      fps: pictures per s.
 
     Raises:
       UserError: there is no ffmpeg.
@@ -42,12 +44,11 @@ def write_mp4(path: Path, take: Take, size: tuple[int, int], overlay: bool) -> N
             f"cannot write '{path}': no ffmpeg: run pip install --force-reinstall imageio-ffmpeg"
         ) from None
     path.touch()  # a folder that is not writable is refused here, in the system's own words
-    pictures = frames(take, size, overlay)
     first = next(pictures)  # what cannot be drawn should not leave an encoder behind
     writer = imageio_ffmpeg.write_frames(
         str(path),
         size,
-        fps=take.fps,  # pyright: ignore[reportArgumentType]
+        fps=fps,  # pyright: ignore[reportArgumentType]
         codec="libx264",
         quality=6,  # crf 20
         macro_block_size=2,
@@ -63,17 +64,20 @@ def write_mp4(path: Path, take: Take, size: tuple[int, int], overlay: bool) -> N
         writer.close()
 
 
-def write_gif(path: Path, take: Take, size: tuple[int, int], overlay: bool) -> None:
-    """Writes at most 15 pictures per s. See `write_mp4` for the arguments."""
-    step = max(round(take.fps / _GIF_FPS), 1)
-    pictures = frames(take, size, overlay, step)
+def write_gif(path: Path, pictures: Iterator[Image.Image], fps: float) -> None:
+    """Writes pictures, `fps` of them per s; `gif_step` says how many to leave out before."""
     first, *others = (picture.quantize(_GIF_COLOURS) for picture in pictures)
-    duration = round(1000.0 * step / take.fps)
+    duration = round(1000.0 / fps)
     first.save(path, save_all=True, append_images=others, duration=duration, loop=0)
 
 
+def gif_step(fps: float) -> int:
+    """Returns which pictures a .gif shows: every so many-th."""
+    return max(round(fps / _GIF_FPS), 1)
+
+
 def frames(
-    take: Take, size: tuple[int, int], overlay: bool, step: int = 1
+    take: Take, size: tuple[int, int], overlay: bool, step: int = 1, legend: bool = True
 ) -> Iterator[Image.Image]:
     """Yields the pictures of a film.
 
@@ -82,6 +86,7 @@ def frames(
       size: width and height in pixels.
       overlay: draw the ghost where the reference is, not beside the simulation.
       step: leave out all poses but every `step`-th.
+      legend: say what the ghost is.
     """
     ghost, middle = take.reference, take.qpos.copy()
     middle[:, 2] -= _BELOW_ROOT * take.body
@@ -100,7 +105,8 @@ def frames(
             )
             image = Image.fromarray(pixels)
             draw = ImageDraw.Draw(image)
-            draw.text((margin, margin), take.labels[i], INK, font)
-            if ghost is not None:
+            told = f"{take.name}   {take.labels[i]}" if take.name else take.labels[i]
+            draw.text((margin, margin), told, INK, font)
+            if ghost is not None and legend:
                 draw.text((size[0] - margin, margin), "green: reference", GREEN, font, anchor="ra")
             yield image
