@@ -14,10 +14,13 @@ from jaxskills.explore import family
 from jaxskills.explore.curriculum import CurriculumConfig
 from jaxskills.explore.elites import EliteConfig, Episodes
 from jaxskills.explore.family import Family, FamilyConfig, Results
+from jaxskills.explore.parameterization import ParameterizationConfig
 from jaxskills.explore.sampling import SamplingConfig
 
 SIZE, STATES = 6, 64
+# A threshold of 0: motions are those of the elites themselves, never the network's.
 CONFIG = FamilyConfig(
+    parameterization=ParameterizationConfig(threshold=0.0),
     curriculum=CurriculumConfig(batch=8, sampling=SamplingConfig(candidates=512, pool=64, chains=8))
 )
 
