@@ -45,12 +45,13 @@ def crowded(state: TrainState, count: int) -> TrainState:
 def parts(config: TrainConfig, count: int) -> dict[str, Callable[[], Any]]:
     """Returns the calls to time, each from the same state."""
     made = families.make(config)
-    assert made.world is not None
+    world_of = made.world
+    assert world_of is not None
     own = families.parts(config, recipes.task(config.task))
     state = crowded(jit(made.init)(jax.random.key(config.seed)), count)
     update = jit(made.update)
-    state, _ = update(state, made.world(state))  # which asks for what comes next
-    now = made.world(state)
+    state, _ = update(state, world_of(state))  # which asks for what comes next
+    now = world_of(state)
     key = jax.random.key(1)
     _, practice, _ = jit(
         lambda state, world: families.practise(own, made.networks, state, world, key)
@@ -61,7 +62,7 @@ def parts(config: TrainConfig, count: int) -> dict[str, Callable[[], Any]]:
     return {
         "update": lambda: update(state, now),
         "stock": lambda: stock(state, now, practice),
-        "world": lambda: made.world(asking(state, next(batches))),
+        "world": lambda: world_of(asking(state, next(batches))),
     }
 
 

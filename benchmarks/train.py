@@ -37,7 +37,8 @@ def parts(config: trainer.TrainConfig) -> dict[str, Callable[[], Any]]:
     update = jit(made.update)
     for _ in range(5):  # away from the very first poses
         state, _ = update(state)
-    env, nets = made.env, made.networks
+    env, nets, current = made.env, made.networks, state.current
+    assert current is not None
     key = jax.random.key(1)
 
     def roll(state: trainer.TrainState) -> Any:
@@ -48,7 +49,7 @@ def parts(config: trainer.TrainConfig) -> dict[str, Callable[[], Any]]:
             nets,
             state.learner.policy,
             state.normalizer,
-            state.current,
+            current,
             fresh,
             key,
             config.horizon,
@@ -62,7 +63,7 @@ def parts(config: trainer.TrainConfig) -> dict[str, Callable[[], Any]]:
         return ppo.update(config.ppo, nets, state.learner, batch, key)
 
     learn = jit(learn)
-    step, sim = physics_only(config, made, state)
+    step, sim = physics_only(config, made, current.state.sim)
     return {
         "update": lambda: update(state),
         "rollout": lambda: roll(state),
@@ -72,7 +73,7 @@ def parts(config: trainer.TrainConfig) -> dict[str, Callable[[], Any]]:
 
 
 def physics_only(
-    config: trainer.TrainConfig, made: trainer.Trainer, state: trainer.TrainState
+    config: trainer.TrainConfig, made: trainer.Trainer, sim: Any
 ) -> tuple[Callable[[Any], Any], Any]:
     """Returns `horizon` physics steps of all environments under zero controls, and the states."""
     backend = physics.default_backend() if config.backend == "auto" else config.backend
@@ -88,7 +89,7 @@ def physics_only(
 
         return jax.lax.scan(advance, sim, None, length=config.horizon)[0]
 
-    return jit(run), state.current.state.sim
+    return jit(run), sim
 
 
 def take_turns(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:

@@ -77,7 +77,7 @@ def digest(folder: Path) -> str:
         (("clips", "sohw"), "sohw; Available subcommands: list, check, show"),
         (("evaluate",), "Missing from jaxskills evaluate: RUN"),
         (("evaluate", "run", "--secnods", "3"), "Perhaps you meant: --seconds"),
-        (("evaluate", "run", "--seconds", "abc"), "--seconds: could not convert string to float"),
+        (("evaluate", "run", "--seconds", "abc"), "--seconds: no type matching {None}|FLOAT"),
         (("evaluate", "run", "--backend", "gpu"), "('auto', 'cpu', 'mjx', 'warp')"),
         (("train",), "Missing from jaxskills train: SKILL"),
         (("train", "walk"), "Missing from jaxskills train: --out RUN"),

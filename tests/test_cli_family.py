@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line on a family: evaluate, render and plot, and what they refuse."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import tiny_family
 from PIL import Image
 
-from jaxskills import arguments, commands, families
+from jaxskills import arguments, checkpoint, commands, families
 from jaxskills.cli import main
 from jaxskills.errors import UserError
 from jaxskills.render import opengl
@@ -102,9 +103,8 @@ def test_what_is_refused_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_skill_takes_no_task(trained, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    skill = trained[0]._replace(task=None), trained[1]
-    monkeypatch.setattr(commands.runs, "open_run", lambda *_: skill)
+def test_a_skill_takes_no_task(trained, tmp_path: Path):
+    checkpoint.write_config(tmp_path, dataclasses.replace(trained[0].config, task=""))
     command = arguments.Render(tmp_path, tmp_path / "a.mp4", task=("height=1",))
     with pytest.raises(UserError, match="--task is height=1: this run is of one skill"):
         commands.film(command)

@@ -21,7 +21,9 @@ SIZE, STATES = 6, 64
 # A threshold of 0: motions are those of the elites themselves, never the network's.
 CONFIG = FamilyConfig(
     parameterization=ParameterizationConfig(threshold=0.0),
-    curriculum=CurriculumConfig(batch=8, sampling=SamplingConfig(candidates=512, pool=64, chains=8))
+    curriculum=CurriculumConfig(
+        batch=8, sampling=SamplingConfig(candidates=512, pool=64, chains=8)
+    ),
 )
 
 

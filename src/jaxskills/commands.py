@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from jaxskills import (
     arguments,
@@ -28,6 +29,7 @@ from jaxskills import (
     render,
     runs,
     style_measures,
+    task_values,
 )
 from jaxskills import character as character_lib
 from jaxskills import evaluate as evaluate_lib
@@ -194,16 +196,24 @@ def _evaluate_family(command: arguments.Evaluate, made: Trainer, state: TrainSta
 def film(command: arguments.Render) -> Answer:
     """Films the controller of a run beside its reference."""
     _admit(command.out, render.FORMATS)
+    if command.task:
+        _check_task(command)  # a mistake is said at once
     made, state = runs.open_run(command.run, command.backend)
     if made.task is not None:
         wanted = playback_family.wanted(made, state, command.task)
         cells = playback_family.cells(made, state, wanted, command.seconds)
         path = playback_family.film(cells, command.out)
-    elif command.task:
-        raise UserError(f"--task is {command.task[0]}: this run is of one skill: leave it out")
     else:
         path = playback.film(made, state, command.out, command.seconds)
     return Answer(f"wrote {path}", {"out": str(path)})
+
+
+def _check_task(command: arguments.Render) -> None:
+    skill = checkpoint.read_config(command.run).task
+    if not skill:
+        raise UserError(f"--task is {command.task[0]}: this run is of one skill: leave it out")
+    spec = recipes.task(skill)
+    task_values.parse(spec, np.zeros(len(spec.free)), command.task)
 
 
 def picture(command: arguments.Plot) -> Answer:

@@ -96,11 +96,11 @@ def run(
     state: TrainState,
     phase: jax.Array,
     steps: int,
-    variant: jax.Array | int = 0,
+    variant: jax.Array | None = None,
 ) -> Trace:
     """Returns the trace of E episodes that begin on the reference at `phase [E]`.
 
-    They are of the variants `[E]`, or all of one.
+    They are of the variants `[E]`, or of the only one.
     """
 
     def advance(now: rollout.Fresh, _: None) -> tuple[rollout.Fresh, Trace]:

@@ -97,7 +97,8 @@ def environment(own: Parts, world: World, asked: family_lib.Asked) -> core.Envir
     """Returns the environment of a batch of task parameters. Its arrays may be traced."""
     layout, length = own.character.layout, float(own.shown.length)
     made = variation_lib.unflatten(asked.x, layout.nv)
-    motions = jax.vmap(functools.partial(variation_lib.displace, layout))(world.motion, made)
+    displace = jax.vmap(functools.partial(variation_lib.displace, layout))
+    motions = jax.jit(displace)(world.motion, made)  # on the host too, and at once
     rows = variants.Variant(motions, made, world.body, world.shapes, asked.a)
     both = variants.Variants(rows, world.model, asked.a.shape[0], length, own.shown.loop)
     config = env_config(own.config, own.shown)
@@ -112,8 +113,8 @@ def _family(config: TrainConfig, spec: TaskSpec) -> Trainer:
         own.character, own.shown, spec, own.engine, CONTROL_DT / config.env.substeps
     )
     world = lambda state: compiled(np.asarray(state.family.asked.a))  # noqa: E731
-    first = family_lib.init(config.family, reference, size, jax.random.key(0))
-    plain = environment(own, compiled(np.asarray(first.asked.a)), first.asked)
+    first = family_lib.first(config.family, reference, size)
+    plain = environment(own, compiled(np.asarray(first.a)), first)
     obs_size = jax.eval_shape(lambda: plain.observe(plain.start(jnp.float32(0.0)))).shape[0]
     nets = networks_lib.make(config.networks, obs_size, plain.action_size, config.ppo.discount)
 

@@ -56,8 +56,8 @@ def cells(
     done, found = perform.perform(made, state, a), []
     for i, who in enumerate(perform.characters(made, a)):
         until = _until(done, i, seconds)
-        poses = (np.asarray(x)[:until, i] for x in (done.trace.qpos, done.reference))
-        found.append(Cell(who, *poses, wanted.names[i // columns][i % columns]))
+        poses, shown = (np.asarray(x)[:until, i] for x in (done.trace.qpos, done.reference))
+        found.append(Cell(who, poses, shown, wanted.names[i // columns][i % columns]))
     return [found[i : i + columns] for i in range(0, len(found), columns)]
 
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from jaxskills import kinematics
 from jaxskills.character import Character
+from jaxskills.compilation import jit
 from jaxskills.env import measure as measure_lib
 from jaxskills.env.measure import Measure, Moment
 from jaxskills.errors import UserError, unknown
@@ -180,19 +181,26 @@ def reference_values(spec: TaskSpec, character: Character, motion: Motion) -> np
         bodies = kinematics.kinematics(tree, params, *sample(layout, motion, phase))
         return Moment(params, bodies)
 
-    moments = jax.jit(jax.vmap(look))(jnp.asarray(shares, jnp.float32))
     seconds = length * CONTROL_DT / (len(shares) - 1)
-    found = []
-    for parameter in spec.measured:
-        made = _measure(parameter)
-        course = np.asarray(jax.vmap(made.quantity(character))(moments))
-        known = measure_lib.start(made)
-        for i in range(1, len(shares)):
-            both = jnp.float32(course[i - 1]), jnp.float32(course[i])
-            step = jnp.float32(shares[i - 1]), jnp.float32(shares[i])
-            known = measure_lib.update(made, known, *both, step, seconds)
-        found.append(float(measure_lib.value(made, known)))
-    return np.array(found)
+    at = jnp.asarray(shares, jnp.float32)
+
+    @jit
+    def values() -> jax.Array:
+        moments, found = jax.vmap(look)(at), []
+        for made in map(_measure, spec.measured):
+            course = jax.vmap(made.quantity(character))(moments)
+
+            def step(known: jax.Array, pairs, made: Measure = made):
+                (before, after), share = pairs
+                known = measure_lib.update(made, known, before, after, share, seconds)
+                return known, None
+
+            pairs = (course[:-1], course[1:]), (at[:-1], at[1:])
+            known, _ = jax.lax.scan(step, measure_lib.start(made), pairs)
+            found.append(measure_lib.value(made, known))
+        return jnp.stack(found)
+
+    return np.array(values(), float) if spec.measured else np.zeros(0)
 
 
 def normalised(parameter: Parameter, value: float) -> float:

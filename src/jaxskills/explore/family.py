@@ -115,6 +115,13 @@ class Results:
     reward: jax.Array  # [] per control frame
 
 
+def first(config: FamilyConfig, reference: jax.Array, size: int) -> Asked:
+    """Returns what is asked for at the beginning: the reference alone. Arguments as of `init`."""
+    batch = config.curriculum.batch
+    itself = jnp.zeros((batch, size))
+    return Asked(jnp.tile(reference, (batch, 1)), jnp.zeros(batch, jnp.int32), itself)
+
+
 def init(config: FamilyConfig, reference: jax.Array, size: int, key: jax.Array) -> Family:
     """Returns the beginning, which asks for the reference alone.
 
@@ -125,19 +132,16 @@ def init(config: FamilyConfig, reference: jax.Array, size: int, key: jax.Array) 
       key: consumed.
     """
     network_key, marginal_key = jax.random.split(key)
-    batch, count = config.curriculum.batch, reference.shape[0]
+    count = reference.shape[0]
     none = jnp.zeros(()), jnp.int32(0)
     base = Base(none[0], none[0], none[0], none[1], none[1], jnp.bool_(False))
-    asked = Asked(
-        jnp.tile(reference, (batch, 1)), jnp.zeros(batch, jnp.int32), jnp.zeros((batch, size))
-    )
     return Family(
         base,
         elites_lib.init(roomy(config.elites, count), count, size),
         parameterization_lib.init(config.parameterization, count, size, network_key),
         marginal_lib.init(config.marginal, count, marginal_key),
         curriculum_lib.init(config.curriculum, reference),
-        asked,
+        first(config, reference, size),
         jnp.uint32(0),
     )
 

@@ -17,6 +17,7 @@ from flax import struct
 
 from jaxskills import ground, kinematics, pose
 from jaxskills.character import Character
+from jaxskills.compilation import jit
 from jaxskills.errors import UserError
 from jaxskills.kinematics import BodyParams, Tree
 from jaxskills.motion import Motion, sample
@@ -82,7 +83,7 @@ def make(character: Character, motion: Motion, config: FitnessConfig) -> Judge:
     bodies = contact_bodies(character, shapes)
     knots = phases(motion)
 
-    @jax.jit
+    @jit
     def of_reference() -> Measures:
         # At its very end a motion is at rest, which an episode on its way past it is not.
         inside = jnp.minimum(knots, jnp.nextafter(motion.length, jnp.zeros_like(motion.length)))

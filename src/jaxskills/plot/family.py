@@ -130,8 +130,10 @@ def curriculum(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
     right.set_ylabel("mean marginal value", fontsize=9, color=BLUE)
     right.tick_params(labelsize=8)
     right.spines[["top", "left"]].set_visible(False)
-    both = [x.get_legend_handles_labels() for x in (axes, right)]
-    handles, labels = (both[0][i] + both[1][i] for i in range(2))
+    (left_handles, left_labels), (more_handles, more_labels) = (
+        x.get_legend_handles_labels() for x in (axes, right)
+    )
+    handles, labels = [*left_handles, *more_handles], [*left_labels, *more_labels]
     below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16)}
     axes.legend(handles, labels, fontsize=8, frameon=False, ncols=6, **below)
 
@@ -142,7 +144,7 @@ def density(explored: Explored, place: tuple[int, ...], axes: Axes) -> None:
     dots = explored.elites[:, list(place)]
     title = f"{len(dots)} elites and their density"
     if len(place) == 1:
-        grid = np.linspace(*ends[0], len(values))
+        grid = np.linspace(ends[0][0], ends[0][1], len(values))
         axes.fill_between(grid, values, where=values > explored.level, color=BLUE, alpha=0.2, lw=0)
         axes.plot(grid, values, color=BLUE, lw=1.6)
         axes.axhline(explored.level, color=GREY, lw=1, ls="--")

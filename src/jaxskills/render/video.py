@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Films: H.264 in .mp4 for every player, and .gif."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -78,7 +78,7 @@ def gif_step(fps: float) -> int:
 
 def frames(
     take: Take, size: tuple[int, int], overlay: bool, step: int = 1, legend: bool = True
-) -> Iterator[Image.Image]:
+) -> Generator[Image.Image, None, None]:
     """Yields the pictures of a film.
 
     Args:
