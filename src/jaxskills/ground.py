@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far each body is above the floor, from the shapes of its geoms.
+"""How far each body is above the floor, or a box on it, from the shapes of its geoms.
 
 One function serves the lift of a start pose out of the floor, the fall test and the clip check, the
 same on every backend. The support of every primitive towards the floor has one closed form, a sum
-of an edge, a ball, a disc and an ellipsoid term.
+of an edge, a ball, a disc and an ellipsoid term. Boxes that stand on the floor are in `terrain`.
 """
 
 import jax
@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from jaxskills import rotation
+from jaxskills import rotation, terrain
 from jaxskills.kinematics import Bodies
 
 _TYPES = mujoco.mjtGeom
@@ -29,6 +29,7 @@ class Shapes:
     disc: jax.Array  # [G] m, radius of a disc across local z
     ellipsoid: jax.Array  # [G, 3] m, half axes
     body: tuple[int, ...] = struct.field(pytree_node=False)  # [G] index among the N bodies
+    boxes: terrain.Boxes | None = None  # whose tops are ground too
 
 
 def shapes(model: mujoco.MjModel) -> Shapes:
@@ -54,11 +55,12 @@ def shapes(model: mujoco.MjModel) -> Shapes:
         mujoco.mju_quat2Mat(frame[i], model.geom_quat[g])
     frame = frame.reshape(-1, 3, 3)
     numbers = (model.geom_pos[rows], frame, edge, ball, disc, ellipsoid)
-    return Shapes(*(jnp.asarray(x, jnp.float32) for x in numbers), body=body)
+    arrays = (jnp.asarray(x, jnp.float32) for x in numbers)
+    return Shapes(*arrays, body=body, boxes=terrain.boxes(model, rows))
 
 
 def geom_clearance(shapes: Shapes, bodies: Bodies) -> jax.Array:
-    """Returns the height `[G]` in m of each geom's lowest point; below 0 it is in the floor."""
+    """Returns how high `[G]` in m each geom's lowest point is; below 0 it is in the floor."""
     body = np.array(shapes.body, int)
     rot = bodies.rot[body]
     # The vertical seen from a body or a geom is the last row of its rotation matrix.
@@ -70,11 +72,18 @@ def geom_clearance(shapes: Shapes, bodies: Bodies) -> jax.Array:
     return center - support
 
 
-def clearance(shapes: Shapes, bodies: Bodies) -> jax.Array:
-    """Returns the height `[N]` in m of each body's lowest point, infinite without geoms."""
+def clearance(shapes: Shapes, bodies: Bodies, inside: bool = False) -> jax.Array:
+    """Returns the height `[N]` in m of each body above the ground, infinite without geoms.
+
+    The ground is the top of the highest box below, or the floor; `inside` is that of
+    `terrain.heights`.
+    """
     count = bodies.pos.shape[0]
-    heights = geom_clearance(shapes, bodies)
-    by_body = [np.flatnonzero(np.array(shapes.body) == body) for body in range(count)]
+    heights, owner = geom_clearance(shapes, bodies), shapes.body
+    if shapes.boxes is not None:
+        over = terrain.heights(shapes.boxes, bodies, inside)
+        heights, owner = jnp.concatenate((heights, over)), (*owner, *shapes.boxes.body)
+    by_body = [np.flatnonzero(np.array(owner) == body) for body in range(count)]
     lowest = [jnp.min(heights[rows]) if len(rows) else jnp.inf for rows in by_body]
     return jnp.stack([jnp.asarray(value, heights.dtype) for value in lowest])
 
