@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Task specifications: what they ask for, what they pay, and which parameter was met instead."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -90,6 +92,38 @@ def test_hindsight_keeps_conditions_and_takes_what_was_measured(who: Character, 
     assert float(constraint) == pytest.approx(1.0, abs=1e-3)
 
 
+def test_a_strict_constraint_is_kept_within_its_sigma(who: Character, walk: Motion):
+    """Steps of a performance that should take as many as the reference, with a sigma of 0.2."""
+    strict = dataclasses.replace(TIME, strict=True)
+    for constraint, kept in ((strict, (False, True, True, False)), (TIME, (True,) * 4)):
+        made = task.make(TaskSpec((HEIGHT, constraint)), who, walk)
+        found = [_play(who, made, [0.25], 1.0, steps)[0] for steps in (22, 26, 35, 40)]
+        assert tuple(bool(made.kept(known)) for known in found) == kept
+
+
+def test_a_parameter_may_be_a_condition_and_measured(who: Character, walk: Motion):
+    both = dataclasses.replace(HEIGHT, condition=conditions.gravity)
+    spec = TaskSpec((both,))
+    made = task.make(spec, who, walk)
+    np.testing.assert_allclose(made.base, [0.25], atol=1e-6)
+    known, _ = _play(who, made, [0.9], 1.4 * float(made.reference[0]))
+    assert made.hindsight(known, jnp.array([0.9]))[0].tolist() == pytest.approx([0.75], abs=1e-4)
+    assert task.variant(spec, who, np.array([1.0])).model.opt.gravity[2] == pytest.approx(-15.696)
+
+
+def test_objects_stand_there_whatever_the_parameters(who: Character):
+    def halved(spec: mujoco.MjSpec, character: Character, factor: float) -> None:
+        assert factor == 1.0
+        spec.option.gravity = [0.0, 0.0, -4.0]
+
+    spec = TaskSpec((GRAVITY,), objects=(halved,))
+    among = task.placed(spec, who)
+    assert among.model.opt.gravity[2] == -4.0 and who.model.opt.gravity[2] == -9.81
+    assert task.variant(spec, among, np.array([1.0])).model.opt.gravity[2] == -8.0
+    fine = task.variant(spec, among, np.array([0.0]), timestep=0.001).model
+    assert (fine.opt.gravity[2], fine.opt.timestep) == (-2.0, 0.001)
+
+
 def test_a_continuous_parameter_pays_on_the_way(who: Character, walk: Motion):
     steady = Parameter(
         "height",
@@ -144,8 +178,13 @@ def test_wrong_values_are_refused(values: dict[str, float], message: str):
     [
         ((HEIGHT, HEIGHT), "height comes twice"),
         ((Parameter("x", (2.0, 1.0), condition=conditions.gravity),), "two numbers in order"),
-        ((Parameter("x", (1.0, 2.0)),), "either a measure or a condition"),
-        ((Parameter("x", (1.0, 1.0), condition=conditions.gravity),), "needs a measure"),
+        ((Parameter("x", (1.0, 2.0)),), "x: give a measure, a condition, or both"),
+        (
+            (Parameter("x", (1.0, 1.0), condition=conditions.gravity),),
+            "needs a measure, and no con",
+        ),
+        ((dataclasses.replace(TIME, condition=conditions.gravity),), "needs a measure, and no con"),
+        ((dataclasses.replace(HEIGHT, strict=True),), "height: strict is for a range of no width"),
         (
             (Parameter("x", (1.0, 2.0), measure=HEIGHT.measure, sigma=0.0),),
             "sigma 0.0: give a positive number",

@@ -8,7 +8,7 @@ follow from the mass and leaf bodies are the end effectors.
 
 import dataclasses
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mujoco
@@ -60,6 +60,7 @@ class Character:
     ground: tuple[str, ...]  # bodies that may touch the ground without it being a fall
     forward: np.ndarray  # [3] facing at the zero pose
     limits: dict[str, dict[str, tuple[float, float]]]  # rad, information for clip checks
+    scene: tuple[Callable[[mujoco.MjSpec], None], ...] = ()  # puts things around it, when compiled
 
     @property
     def mass(self) -> float:
@@ -142,6 +143,19 @@ def load(name: str) -> Character:
     return dataclasses.replace(character, model=compile(character, DEFAULT_TIMESTEP))
 
 
+def placed(
+    character: Character,
+    scene: Sequence[Callable[[mujoco.MjSpec], None]],
+    timestep: float = DEFAULT_TIMESTEP,
+) -> Character:
+    """Returns the character among more things, which `scene` puts into the spec one by one.
+
+    Whatever is made of it simulates, measures and films it there. Its model has this time step (s).
+    """
+    among = dataclasses.replace(character, scene=(*character.scene, *scene))
+    return dataclasses.replace(among, model=compile(among, timestep))
+
+
 def compile(  # noqa: A001
     character: Character,
     timestep: float,
@@ -160,7 +174,8 @@ def compile(  # noqa: A001
       character: what to compile.
       timestep: h in s.
       integrator: one of `INTEGRATORS`.
-      edit: changes the spec before servos are added, for a variant of the character.
+      edit: changes the spec before servos are added, for a variant of the character. Actuators
+        that it or the character's scene adds come first.
 
     Raises:
       UserError: unknown integrator.
@@ -168,8 +183,8 @@ def compile(  # noqa: A001
     if integrator not in INTEGRATORS:
         raise unknown("integrator", integrator, INTEGRATORS)
     spec = _bare_spec(Path(character.source))
-    if edit is not None:
-        edit(spec)
+    for change in (*character.scene, *(() if edit is None else (edit,))):
+        change(spec)
     spec.option.timestep = timestep
     spec.option.integrator = INTEGRATORS[integrator]
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -8,10 +8,10 @@
         )
     )
 
-A parameter is either measured in the performance, which the task reward asks for, or a condition
-that is set before it. Ranges are in multiples of the reference. Learning sees parameters
-*normalised*: 0 at the lower end of the range, 1 at the upper. A range of no width is a constraint:
-it is asked for too, but is no parameter.
+A parameter is measured in the performance, which the task reward asks for, or a condition that is
+set before it, or both: where a box stands, and how far the jump onto it went. Ranges are in
+multiples of the reference. Learning sees parameters *normalised*: 0 at the lower end of the range,
+1 at the upper. A range of no width is a constraint: it is asked for too, but is no parameter.
 """
 
 import dataclasses
@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxskills import character as character_lib
 from jaxskills import kinematics
 from jaxskills.character import Character
 from jaxskills.compilation import jit
@@ -49,6 +50,8 @@ class Parameter:
     relative: bool = True  # the range is in multiples of the reference's own value; else absolute
     sigma: float = 0.1  # of the task reward (FS eq. 8), in units of the range
     continuous: bool = False  # the quantity is asked for all the way, not its measure at the end
+    # Of a constraint: a performance that misses it by more than its sigma does not count.
+    strict: bool = False
 
     @property
     def fixed(self) -> bool:
@@ -63,6 +66,7 @@ class TaskSpec:
     parameters: tuple[Parameter, ...] = ()
     spike_weight: float = 10.0  # w_task of FS section 4.2 for spike rewards
     continuous_weight: float = 0.1  # and for continuous ones
+    objects: tuple[Condition, ...] = ()  # what stands around, whatever the parameters; factor 1
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -85,6 +89,7 @@ class Task(NamedTuple):
     observe: Callable[[jax.Array, jax.Array], jax.Array]
     # (known, a [P]) -> the parameter that was met [P], how well constraints were [] in 0 to 1
     hindsight: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+    kept: Callable[[jax.Array], jax.Array]  # (known) -> [] bool, whether strict constraints are met
     reference: jax.Array  # [M] what the reference measures
     base: np.ndarray  # [P] normalised parameter of the reference
     begin: float  # share of the reference before which nothing is measured
@@ -162,10 +167,49 @@ def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
         off = jnp.where(fixed, ((found - low) / sigma) ** 2, 0.0) if measures else jnp.zeros(1)
         return a, jnp.exp(-jnp.sum(off))
 
+    strict = np.array([p.strict for p in measured], bool)
+
+    def kept(known: jax.Array) -> jax.Array:
+        return jnp.all(~strict | (jnp.abs(values(known) - low) <= sigma))
+
     base = np.array([normalised(p, _own(p, measured, own)) for p in free])
     weight = 1.0 - spec.continuous_weight if steady.any() else 1.0
     own = jnp.asarray(own, jnp.float32)
-    return Task(start, step, observe, hindsight, own, base, begin, end, weight)
+    return Task(start, step, observe, hindsight, kept, own, base, begin, end, weight)
+
+
+def placed(spec: TaskSpec, character: Character) -> Character:
+    """Returns the character among the objects of a task."""
+    return character_lib.placed(character, [_applied(one, character, 1.0) for one in spec.objects])
+
+
+def variant(
+    spec: TaskSpec,
+    character: Character,
+    a: np.ndarray,
+    timestep: float = character_lib.DEFAULT_TIMESTEP,
+) -> Character:
+    """Returns the character under the conditions of a task parameter, to simulate or film it.
+
+    Args:
+      spec: of the task.
+      character: among its objects, see `placed`.
+      a: `[P]` the task parameter, normalised.
+      timestep: s, of its model.
+    """
+    pairs = zip(spec.free, np.asarray(a), strict=True)
+    changes = [
+        _applied(p.condition, character, float(p.range[0] + _width(p.range) * value))
+        for p, value in pairs
+        if p.condition is not None
+    ]
+    return character_lib.placed(character, changes, timestep)
+
+
+def _applied(
+    condition: Condition, character: Character, factor: float
+) -> Callable[[mujoco.MjSpec], None]:
+    return lambda spec: condition(spec, character, factor)
 
 
 def reference_values(spec: TaskSpec, character: Character, motion: Motion) -> np.ndarray:
@@ -247,10 +291,14 @@ def validate(spec: TaskSpec) -> None:
             raise UserError(f"task parameter {p.name} comes twice: give each its own name")
         if not (all(map(math.isfinite, p.range)) and p.range[0] <= p.range[1]):
             raise UserError(f"task parameter {p.name}: range {p.range}: give two numbers in order")
-        if (p.measure is None) == (p.condition is None):
-            raise UserError(f"task parameter {p.name}: give either a measure or a condition")
-        if p.fixed and p.measure is None:
-            raise UserError(f"task parameter {p.name}: a range of no width needs a measure")
+        if p.measure is None and p.condition is None:
+            raise UserError(f"task parameter {p.name}: give a measure, a condition, or both")
+        if p.strict and not p.fixed:
+            raise UserError(f"task parameter {p.name}: strict is for a range of no width")
+        if p.fixed and (p.measure is None or p.condition is not None):
+            raise UserError(
+                f"task parameter {p.name}: a range of no width needs a measure, and no condition"
+            )
         if not p.sigma > 0:
             raise UserError(f"task parameter {p.name}: sigma {p.sigma}: give a positive number")
         if p.measure is not None:
