@@ -19,7 +19,7 @@ from jaxskills import ground, kinematics, pose
 from jaxskills import variation as variation_lib
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
-from jaxskills.env import gram, observe, rewards
+from jaxskills.env import gram, holds, observe, rewards
 from jaxskills.env import style as style_lib
 from jaxskills.env import tracking as tracking_lib
 from jaxskills.env.measure import Moment
@@ -215,7 +215,7 @@ def make(
         variant = jnp.asarray(variant, jnp.int32)
         own = pick(variants, variant)
         bodies = kinematics.kinematics(tree, own.body, qpos, qvel)
-        lowest = jnp.min(ground.clearance(own.shapes, bodies))
+        lowest = jnp.min(ground.clearance(own.shapes, bodies, inside=True))
         qpos = qpos.at[2].add(jnp.maximum(_LIFT_MARGIN - lowest, 0.0))
         sim = physics.init(variants.model, variant, qpos, qvel)
         window = None if wanted is None else gram.fill(wanted, phase)
@@ -233,6 +233,15 @@ def make(
         warp = jnp.clip(config.warp_scale * action[-1], *config.warp_limits)
         return natural * jnp.exp(warp), natural
 
+    def grips(state: EnvState) -> jax.Array | None:
+        """Returns the controls of what hands hold, if they may hold anything."""
+        own, sim = pick(variants, state.variant), state.sim
+        if own.holds is None:
+            return None
+        bodies = kinematics.kinematics(tree, own.body, sim.qpos, sim.qvel)
+        within = state.phase % length if loop else state.phase
+        return holds.controls(own.holds, bodies, within / length)
+
     def advance(
         state: EnvState, action: jax.Array, taken: tuple[jax.Array, jax.Array]
     ) -> tuple[SimState, jax.Array]:
@@ -241,12 +250,14 @@ def make(
             own, (chosen, natural) = pick(variants, state.variant), taken
             base, ahead = sample(layout, own.motion, state.phase + config.lead * chosen)
             speed = ahead * (chosen / natural) if config.velocity_feedforward else speed
+        held = grips(state)
         push = action[: len(dofs)]
         target = pose.plus(layout, base, jnp.zeros(layout.nv).at[dofs].set(push))
 
         def substep(sim: SimState, _: None) -> tuple[SimState, jax.Array]:
             ctrl = servo.controls(servos, layout, sim.qpos, sim.qvel, target, speed)
-            return physics.step(variants.model, state.variant, sim, ctrl), ctrl
+            both = ctrl if held is None else jnp.concatenate((held, ctrl))
+            return physics.step(variants.model, state.variant, sim, both), ctrl
 
         sim, ctrl = jax.lax.scan(substep, state.sim, None, length=config.substeps)
         return sim, ctrl[-1]

@@ -15,6 +15,8 @@ from flax import struct
 from jaxskills import ground, kinematics
 from jaxskills import variation as variation_lib
 from jaxskills.character import Character
+from jaxskills.env import holds
+from jaxskills.env.holds import Holds
 from jaxskills.ground import Shapes
 from jaxskills.kinematics import BodyParams
 from jaxskills.motion import Motion
@@ -30,6 +32,7 @@ class Variant:
     body: BodyParams  # lengths and masses
     shapes: Shapes  # what can touch the ground
     task: jax.Array  # [P] the task parameter, normalised; P is 0 for a skill
+    holds: Holds | None = None  # what hands may hold
 
 
 @struct.dataclass
@@ -65,7 +68,7 @@ def row(character: Character, motion: Motion, variation: Variation, task: jax.Ar
       task: `[P]` the task parameter, normalised.
     """
     params, shapes = kinematics.body_params(character.model), ground.shapes(character.model)
-    return Variant(motion, variation, params, shapes, task)
+    return Variant(motion, variation, params, shapes, task, holds.of(character.model))
 
 
 def stack(rows: Sequence[Variant], model: Any) -> Variants:
