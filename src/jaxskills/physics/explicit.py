@@ -7,6 +7,8 @@ that acts on one joint axis both are diagonal: h D + h^2 K is an armature, and -
 more damping. Contacts and limits keep their form under other constants. So Euler steps of the
 changed model are `discrete` steps: to rounding without contacts, and nearly so with them, where
 the engine's own correction of the contact softness depends on the pose and this one does not.
+Springs and dampers that a control switches on, those of hands that hold something, stay as they
+are: their forces are those of the beginning of the step.
 """
 
 import copy
@@ -47,20 +49,25 @@ def from_discrete(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def _check(model: mujoco.MjModel) -> None:
-    joint = int(mujoco.mjtTrn.mjTRN_JOINT)
-    if (model.actuator_trntype != joint).any():
-        raise UserError("backend 'mjx' under 'discrete': only actuators on joints are supported")
+    on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    switched = model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE
+    if not (on_joint | switched).all():
+        raise UserError(
+            "backend 'mjx' under 'discrete': only servos on joints, and actuators without a bias,"
+            " are supported"
+        )
     for field in ("jnt_stiffness", "tendon_stiffness", "tendon_damping"):
         if getattr(model, field).any():
             raise UserError(f"backend 'mjx' under 'discrete': {field} must be 0, use servos")
 
 
 def _moments(model: mujoco.MjModel) -> np.ndarray:
-    """Returns [nu, nv]: the degrees of freedom each actuator acts on, times its gear."""
+    """Returns [nu, nv]: the degrees of freedom each servo acts on, times its gear."""
     moments = np.zeros((model.nu, model.nv))
-    for row, joint, gear in zip(
-        moments, model.actuator_trnid[:, 0], model.actuator_gear, strict=True
-    ):
+    kinds, joints = model.actuator_trntype, model.actuator_trnid[:, 0]
+    for row, kind, joint, gear in zip(moments, kinds, joints, model.actuator_gear, strict=True):
+        if kind != mujoco.mjtTrn.mjTRN_JOINT:
+            continue
         first, count = model.jnt_dofadr[joint], _AXES[int(model.jnt_type[joint])]
         row[first : first + count] = gear[:count]
     return moments

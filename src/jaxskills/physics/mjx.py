@@ -95,6 +95,8 @@ def load(models: Sequence[mujoco.MjModel], impl: str, num_envs: int) -> MjxModel
 def _put(model: mujoco.MjModel, impl: str, sizes: dict[str, Any]) -> tuple[Any, mjx.Data]:
     """Returns the model on the device, and a Data of it."""
     placed = mjx.put_model(model, impl=impl)
+    if impl == "jax" and model.nhfield == 0:  # sizes of geoms that only height fields compile in
+        placed = placed.tree_replace({"_impl.geom_rbound_hfield": np.zeros(model.ngeom)})
     if impl == "warp":  # it would print from the device; `_advance_warp` reports instead
         placed = placed.tree_replace({"opt._impl.warn_overflow": 0})
     return placed, mjx.make_data(model, impl=impl, **sizes)
