@@ -14,8 +14,10 @@ import pytest
 import tiny
 import variations
 
-from jaxskills import ground
+from jaxskills import ground, kinematics
 from jaxskills.character import Character
+from jaxskills.env import obstacles
+from jaxskills.env.task import TaskSpec, placed
 from jaxskills.errors import UserError
 from jaxskills.explore import fitness as lib
 from jaxskills.explore.fitness import Fitness, FitnessConfig
@@ -196,6 +198,27 @@ def test_worse_faults_cost_more_and_only_their_factor(
             else:
                 assert value == pytest.approx(1.0, abs=1e-4), (name, size)
             before[name] = value
+
+
+def test_a_lift_of_ground_and_motion_counts_nothing(who: Character, bow: Motion, judge: Callable):
+    """A faulty episode on a box of 0.7 m is worth what it is worth on the floor, and less below it.
+
+    It is then judged by the ground that it has under it.
+    """
+    qpos, qvel = _faulty(who, bow, 3, 0.1)
+    here = judge(_episode(bow, qpos, qvel))
+    box = obstacles.box((0.0, 0.0), (20.0, 20.0), 0.7)
+    among = placed(TaskSpec(objects=(box,)), who).model
+    own = kinematics.body_params(among), ground.shapes(among)
+    compiled = jax.jit(lib.make(who, bow, CONFIG))
+    for lift, same in ((0.7, True), (0.5, False)):
+        moved = qpos + np.eye(13)[2] * lift
+        rows = [jnp.asarray(row) for row in _episode(bow, moved, qvel)]
+        found = jax.tree.map(float, compiled(*rows, jnp.float32(0.0), own))
+        for name in FACTORS:
+            if name != "contact" or same:
+                assert getattr(found, name) == pytest.approx(getattr(here, name), rel=1e-3), name
+        assert same or found.contact < 0.01 < here.contact
 
 
 def test_where_it_happens_and_which_way_it_faces_counts_nothing(

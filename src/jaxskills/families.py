@@ -56,7 +56,11 @@ def make(config: TrainConfig, spec: TaskSpec | None = None) -> Trainer:
       UserError: a value out of range, an unknown name, a broken clip, character or task.
     """
     spec = recipes.task(config.task) if spec is None and config.task else spec
-    return trainer.make(config) if spec is None else _family(config, spec)
+    if spec is None:
+        return trainer.make(config)
+    if spec.free:
+        return _family(config, spec)
+    return trainer.make(config, task_lib.placed(spec, character_lib.load(config.character)))
 
 
 class Parts(NamedTuple):
@@ -79,16 +83,18 @@ def parts(config: TrainConfig, spec: TaskSpec) -> Parts:
       UserError: as `make`.
     """
     validate(config)
-    character = character_lib.load(config.character)
+    character = task_lib.placed(spec, character_lib.load(config.character))
     shown = trainer.reference(config, character)
+    task = task_lib.make(spec, character, shown)
+    itself = task_lib.variant(spec, character, task.base)
     return Parts(
         config,
         character,
         shown,
-        task_lib.make(spec, character, shown),
+        task,
         physics_lib.make(trainer.backend(config), 1, num_envs=config.envs),
         bounds_lib.make(character, config.bounds),
-        fitness.make(character, shown, config.family.fitness),
+        fitness.make(itself, shown, config.family.fitness),
         variation_lib.knot_count(config.family.variation, shown),
     )
 
@@ -99,7 +105,7 @@ def environment(own: Parts, world: World, asked: family_lib.Asked) -> core.Envir
     made = variation_lib.unflatten(asked.x, layout.nv)
     displace = jax.vmap(functools.partial(variation_lib.displace, layout))
     motions = jax.jit(displace)(world.motion, made)  # on the host too, and at once
-    rows = variants.Variant(motions, made, world.body, world.shapes, asked.a)
+    rows = variants.Variant(motions, made, world.body, world.shapes, asked.a, world.holds)
     both = variants.Variants(rows, world.model, asked.a.shape[0], length, own.shown.loop)
     config = env_config(own.config, own.shown)
     return core.make(own.character, both, own.engine, own.bounds, config, task=own.task)
@@ -205,6 +211,7 @@ def take_stock(
     found = episodes.finished(
         own.character.layout,
         world.motion,
+        (world.body, world.shapes),
         own.task,
         own.judge,
         record,

@@ -18,6 +18,7 @@ from flax import struct
 from jaxskills import evaluate, families, motion, variation
 from jaxskills.character import Character
 from jaxskills.compilation import jit
+from jaxskills.env import task as task_lib
 from jaxskills.env import worlds
 from jaxskills.env.task import TaskSpec
 from jaxskills.env.worlds import World
@@ -95,8 +96,7 @@ def parts(
 def characters(made: Trainer, a: np.ndarray) -> list[Character]:
     """Returns the character as each of `a [E, P]` asks for it: its body, in its world."""
     spec, timestep = task_of(made), CONTROL_DT / made.config.env.substeps
-    models = [worlds.compiled(made.character, spec, row, timestep) for row in np.asarray(a)]
-    return [dataclasses.replace(made.character, model=model) for model in models]
+    return [task_lib.variant(spec, made.character, row, timestep) for row in np.asarray(a)]
 
 
 def _perform(
@@ -116,12 +116,13 @@ def _perform(
     # Episodes are judged by the states before each step.
     begin = jax.vmap(env.start)(jnp.zeros(count), which)
     before = lambda first, rows: jnp.concatenate((first[None], rows[:-1]))  # noqa: E731
-    judged = jax.vmap(own.judge, in_axes=(1, 1, 1, 1, 0))(
+    judged = jax.vmap(own.judge, in_axes=(1, 1, 1, 1, 0, 0))(
         before(begin.sim.qpos, trace.qpos),
         before(begin.sim.qvel, trace.qvel),
         before(begin.phase, trace.phase),
         jnp.arange(steps)[:, None] <= last,
         constraint,
+        (world.body, world.shapes),
     )
     varied = variation.unflatten(x, layout.nv)
     shown = jax.vmap(functools.partial(variation.displace, layout))(world.motion, varied)

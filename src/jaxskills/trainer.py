@@ -17,9 +17,9 @@ from flax import struct
 
 from jaxskills import character as character_lib
 from jaxskills import clip as clip_lib
+from jaxskills import levels, pose, retarget
 from jaxskills import motion as motion_lib
 from jaxskills import physics as physics_lib
-from jaxskills import pose, retarget
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import core, gram, variants
@@ -98,10 +98,11 @@ class Trainer(NamedTuple):
 
 
 def reference(config: TrainConfig, character: Character) -> Motion:
-    """Returns the clip of a configuration as a motion of the character."""
+    """Returns the clip of a configuration as a motion of the character, where it stands."""
     clip = clip_lib.cut(clip_lib.load(config.clip), config.motion.start, config.motion.end)
     qpos = retarget.retarget(character, clip)
-    return motion_lib.from_qpos(character.model, qpos, clip.times, clip.loop, config.motion)
+    made = motion_lib.from_qpos(character.model, qpos, clip.times, clip.loop, config.motion)
+    return levels.raised(character, made)
 
 
 def backend(config: TrainConfig) -> str:
@@ -140,14 +141,18 @@ def style(config: TrainConfig, character: Character, motion: Motion, clip: str) 
     return gram.make(character, motion, shown, encode, model.width, wanted.look_back)
 
 
-def make(config: TrainConfig) -> Trainer:
+def make(config: TrainConfig, character: Character | None = None) -> Trainer:
     """Returns the trainer of a configuration.
+
+    Args:
+      config: all settings.
+      character: the configuration's, among the things that stand around it; None: on its own.
 
     Raises:
       UserError: a value out of range, an unknown name, a broken clip or character.
     """
     validate(config)
-    character = character_lib.load(config.character)
+    character = character_lib.load(config.character) if character is None else character
     motion = reference(config, character)
     env = environment(config, character, motion, config.envs)
     obs_size = jax.eval_shape(lambda: env.observe(env.start(jnp.float32(0.0)))).shape[0]
@@ -247,7 +252,7 @@ def refined(made: Trainer) -> Trainer:
     """
     env = made.config.env
     finer = dataclasses.replace(env, substeps=env.substeps * made.config.refine.factor)
-    return make(dataclasses.replace(made.config, env=finer))
+    return make(dataclasses.replace(made.config, env=finer), made.character)
 
 
 def to_batch(

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bodies and physics of a batch of task parameters, compiled on the host (FS section 4.2)."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -12,13 +11,15 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from jaxskills import character as character_lib
-from jaxskills import ground, kinematics
+from jaxskills import ground, kinematics, levels
 from jaxskills.character import Character
+from jaxskills.env import holds as holds_lib
+from jaxskills.env import task as task_lib
+from jaxskills.env.holds import Holds
 from jaxskills.env.task import TaskSpec
 from jaxskills.ground import Shapes
-from jaxskills.kinematics import BodyParams, Tree
-from jaxskills.motion import CONTROL_DT, Motion
+from jaxskills.kinematics import BodyParams
+from jaxskills.motion import Motion
 from jaxskills.physics import Physics
 
 
@@ -29,6 +30,7 @@ class World:
     motion: Motion  # [W] the reference on their bodies
     body: BodyParams  # [W]
     shapes: Shapes  # [W]
+    holds: Holds | None  # [W]
     model: Any  # what `physics.load` returned
 
 
@@ -44,71 +46,25 @@ def make(
       engine: loads the models.
       timestep: of physics, s.
     """
-    conditions = [(i, p) for i, p in enumerate(spec.free) if p.condition is not None]
-    level = jax.jit(
-        functools.partial(
-            _levelled, kinematics.tree(character.model), shown, _physique(character.model)
-        )
-    )
+    conditions = [i for i, p in enumerate(spec.free) if p.condition is not None]
+    tree = kinematics.tree(character.model)
+    level = jax.jit(functools.partial(levels.of_variants, tree, shown, _own(character.model)[:2]))
 
     @functools.lru_cache(maxsize=1)
     def of(rows: tuple[tuple[float, ...], ...]) -> World:
-        models = [compiled(character, spec, np.array(row), timestep) for row in rows]
-        physiques = [_physique(model) for model in models]
-        body, shapes = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *physiques)
+        made = functools.partial(task_lib.variant, spec, character, timestep=timestep)
+        models = [made(np.array(row)).model for row in rows]
+        own = [_own(model) for model in models]
+        body, shapes, holds = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *own)
         motions = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(rows), *x.shape)), shown)
         if conditions:
-            motions = level(body, shapes)
-        return World(motions, body, shapes, engine.load(models))
+            motions = level((body, shapes))
+        return World(motions, body, shapes, holds, engine.load(models))
 
     # Without conditions all batches have the same world, which is compiled once.
-    parameters = [i for i, _ in conditions]
-    few = lambda row: tuple(float(v) if i in parameters else 0.0 for i, v in enumerate(row))  # noqa: E731
+    few = lambda row: tuple(float(v) if i in conditions else 0.0 for i, v in enumerate(row))  # noqa: E731
     return lambda a: of(tuple(few(row) for row in a))
 
 
-def compiled(
-    character: Character, spec: TaskSpec, a: np.ndarray, timestep: float
-) -> mujoco.MjModel:
-    """Returns the model of a character under the conditions of `a [P]`."""
-
-    def edit(model: mujoco.MjSpec) -> None:
-        for parameter, value in zip(spec.free, a, strict=True):
-            if parameter.condition is not None:
-                low, high = parameter.range
-                parameter.condition(model, character, float(low + (high - low) * value))
-
-    return character_lib.compile(character, timestep, edit=edit)
-
-
-def _physique(model: mujoco.MjModel) -> tuple[BodyParams, Shapes]:
-    return kinematics.body_params(model), ground.shapes(model)
-
-
-def _levelled(
-    tree: Tree,
-    shown: Motion,
-    own: tuple[BodyParams, Shapes],
-    body: BodyParams,
-    shapes: Shapes,
-) -> Motion:
-    """Returns the motion of `[W]` other bodies: as far over the ground as on the character's own.
-
-    Longer legs would reach into it, shorter ones hang above.
-    """
-
-    def lowest(body: BodyParams, shapes: Shapes) -> jax.Array:
-        def one(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-            return jnp.min(ground.clearance(shapes, kinematics.kinematics(tree, body, qpos, qvel)))
-
-        return jax.vmap(one)(shown.qpos, shown.qvel)
-
-    frame = shown.length * CONTROL_DT / (shown.qpos.shape[0] - 1)
-
-    def of(body: BodyParams, shapes: Shapes) -> Motion:
-        lift = lowest(*own) - lowest(body, shapes)
-        qpos = shown.qpos.at[:, 2].add(lift)
-        qvel = shown.qvel.at[:, 2].add(jnp.asarray(jnp.gradient(lift)) / frame)
-        return dataclasses.replace(shown, qpos=qpos, qvel=qvel)
-
-    return jax.vmap(of)(body, shapes)
+def _own(model: mujoco.MjModel) -> tuple[BodyParams, Shapes, Holds | None]:
+    return kinematics.body_params(model), ground.shapes(model), holds_lib.of(model)

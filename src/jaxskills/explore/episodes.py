@@ -12,6 +12,8 @@ from jaxskills import variation as variation_lib
 from jaxskills.env.task import Task
 from jaxskills.explore.elites import Episodes
 from jaxskills.explore.fitness import Judge
+from jaxskills.ground import Shapes
+from jaxskills.kinematics import BodyParams
 from jaxskills.motion import Motion
 from jaxskills.pose import Layout
 
@@ -42,6 +44,7 @@ class Found(NamedTuple):
 def finished(
     layout: Layout,
     motions: Motion,
+    own: tuple[BodyParams, Shapes],
     task: Task,
     judge: Judge,
     record: Record,
@@ -53,11 +56,13 @@ def finished(
 ) -> Found:
     """Returns the episodes that went from phase 0 to the end, the first `most` of them.
 
-    Each counts with the parameter that it met, not the one that it was asked for (FS 5.1).
+    Those that miss a strict constraint do not count. The others count with the parameter that they
+    met, not the one that they were asked for (FS 5.1).
 
     Args:
       layout: of the poses.
       motions: `[W]` the undisplaced references of the variants.
+      own: `[W]` their bodies, and their shapes with the ground below.
       task: what is measured.
       judge: gives the fitness of an episode.
       record: `[T, B]`.
@@ -71,17 +76,18 @@ def finished(
     last, who = jnp.nonzero(whole, size=most, fill_value=-1)
 
     def one(last: jax.Array, who: jax.Array) -> tuple[jax.Array, ...]:
-        own = variant[who]
+        row = variant[who]
         count = record.step[last, who] + 1
         rows = jnp.clip(last - count + 1 + jnp.arange(longest), 0, record.phase.shape[0] - 1)
         valid = jnp.arange(longest) < count
         qpos, qvel, phase = (x[rows, who] for x in (record.qpos, record.qvel, record.phase))
         tau = jnp.log(record.dphase[rows, who])
-        motion = jax.tree.map(lambda x: x[own], motions)
+        motion, mine = jax.tree.map(lambda x: x[row], (motions, own))
         made, covered = trace.trace_to_variation(layout, motion, qpos, phase, tau, valid, knots)
-        met, constraint = task.hindsight(record.known[last, who], asked[own])
-        fitness = judge(qpos, qvel, phase, valid, constraint).total
-        sound = (last >= 0) & (covered > _LEAST_COVERAGE)
+        known = record.known[last, who]
+        met, constraint = task.hindsight(known, asked[row])
+        fitness = judge(qpos, qvel, phase, valid, constraint, mine).total
+        sound = (last >= 0) & (covered > _LEAST_COVERAGE) & task.kept(known)
         return met, variation_lib.flatten(made), fitness, sound
 
     def group(places: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:

@@ -66,16 +66,18 @@ class Fitness:
     total: jax.Array  # [] the product, and the constraints' share on top
 
 
-# (qpos [T, nq], qvel [T, nv], phase [T], valid [T], constraint []) of one episode
-Judge = Callable[[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array], Fitness]
+# (qpos [T, nq], qvel [T, nv], phase [T], valid [T], constraint []) of one episode, and the bodies
+# and shapes it was performed with, unless they are the reference's
+Judge = Callable[..., Fitness]
 
 
 def make(character: Character, motion: Motion, config: FitnessConfig) -> Judge:
     """Returns the function that judges one episode by the reference `motion`; `vmap` it for more.
 
-    Its rows are those of `trace.trace_to_variation`; `constraint` is r_constraint in [0, 1], 0 if
-    there is none. An episode that ends early is judged as if it stood still: have its coverage
-    checked. One without any usable row is worth nothing.
+    The ground that heights are over is the floor and what stands on it, for the reference that of
+    the character's model. The rows are those of `trace.trace_to_variation`; `constraint` is
+    r_constraint in [0, 1], 0 if there is none. An episode that ends early is judged as if it stood
+    still: have its coverage checked. One without any usable row is worth nothing.
     """
     validate(config)
     tree, params = kinematics.tree(character.model), kinematics.body_params(character.model)
@@ -98,6 +100,7 @@ def make(character: Character, motion: Motion, config: FitnessConfig) -> Judge:
         phase: jax.Array,
         valid: jax.Array,
         constraint: jax.Array,
+        own: tuple[BodyParams, ground.Shapes] | None = None,
     ) -> Fitness:
         valid = usable(valid, qpos, qvel, phase)
         # Rows that are not used must be numbers all the same: row 0 stands in if there is none.
@@ -106,7 +109,7 @@ def make(character: Character, motion: Motion, config: FitnessConfig) -> Judge:
         near = neighbours(jnp.where(valid, phase, 0.0), valid, knots)
         at = pose.lerp(layout, qpos[near.low], qpos[near.high], near.share)
         speed = qvel[near.low] + near.share[:, None] * (qvel[near.high] - qvel[near.low])
-        seen = measure(tree, params, shapes, bodies, at, speed)
+        seen = measure(tree, *(own or (params, shapes)), bodies, at, speed)
         found = fitness(config, layout, reference, seen, constraint)
         return jax.tree.map(lambda one: jnp.where(valid.any(), one, 0.0), found)
 
@@ -136,7 +139,7 @@ def measure(
     qpos: jax.Array,
     qvel: jax.Array,
 ) -> Measures:
-    """Returns what fitness looks at in states `qpos [N, nq]`, `qvel [N, nv]` over a flat floor."""
+    """Returns what fitness looks at in states `qpos [N, nq]`, `qvel [N, nv]`."""
     rows = np.array(bodies, int)
 
     def one(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
