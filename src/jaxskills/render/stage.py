@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A photo studio for characters: checkered floor, plain backdrop, one light, one camera, a ghost.
 
-Everything but the character comes from here, as geoms added to MuJoCo's scene, so every MJCF looks
-the same and needs no floor texture, sky or light of its own.
+Everything but the character and what stands around it comes from here, as geoms added to MuJoCo's
+scene, so every MJCF looks the same and needs no floor texture, sky or light of its own.
 """
 
 import contextlib
@@ -58,6 +58,7 @@ class Stage:
 
     solid: mujoco.MjData
     ghost: mujoco.MjData
+    scenery: mujoco.MjData
     lens: Lens
     width: int
     height: int
@@ -75,7 +76,7 @@ def opened(
     """Yields a stage and frees its graphics memory afterwards.
 
     Args:
-      model: the character.
+      model: the character, and what stands around it.
       forward: [3] its facing at the zero pose, which tells left from right.
       lens: the camera.
       width: of the pictures, in pixels.
@@ -105,8 +106,8 @@ def opened(
         last_first.callback(gl.make_current)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
         scene = mujoco.MjvScene(solid, maxgeom=2 * model.ngeom + _MAX_TILES + 1000)
-        both = mujoco.MjData(solid), mujoco.MjData(ghost)
-        yield Stage(*both, lens, width, height, body, floor, scene, context, gl)
+        figures = [mujoco.MjData(one) for one in (solid, ghost, _scenery(solid))]
+        yield Stage(*figures, lens, width, height, body, floor, scene, context, gl)
 
 
 def picture(
@@ -123,6 +124,8 @@ def picture(
     stage.gl.make_current()
     scene = stage.scene
     scene.ngeom = 0
+    if qpos is None:
+        _add_figure(scene, stage.scenery, stage.scenery.model.qpos0)
     for data, pose in ((stage.solid, qpos), (stage.ghost, ghost)):
         if pose is not None:
             _add_figure(scene, data, pose)
@@ -207,6 +210,13 @@ def _ghost(model: mujoco.MjModel) -> mujoco.MjModel:
     copied.geom_group[~_character(model)] = _HIDDEN
     copied.geom_matid[:] = -1
     copied.geom_rgba[:] = GHOST
+    return copied
+
+
+def _scenery(solid: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns a copy of which only what never moves is seen."""
+    copied = copy.copy(solid)
+    copied.geom_group[solid.body_weldid[solid.geom_bodyid] != 0] = _HIDDEN
     return copied
 
 
