@@ -19,6 +19,8 @@ from jaxskills.explore.curriculum import CurriculumConfig
 from jaxskills.explore.family import FamilyConfig
 from jaxskills.trainer import Trainer
 
+SLOW = pytest.mark.slow  # making a family compiles for a minute
+
 _ALONG = measure.change(measure.com_along((1.0, 0.0, 0.0)), 0.1, 0.9)
 
 # The walk begins on the first box and gets to the second, held at the torso by a bar.
@@ -52,6 +54,8 @@ def family(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
     return families.make(config, SPEC)
 
 
+@SLOW
+@pytest.mark.timeout(1800)
 def test_each_variant_has_its_own_ground_and_level(family: Trainer):
     state = jax.eval_shape(family.init, jax.random.key(0))
     assert family.world is not None and state.family is not None
@@ -67,6 +71,8 @@ def test_each_variant_has_its_own_ground_and_level(family: Trainer):
     np.testing.assert_allclose(at.holds.middle, [[[0.25, 0.0, 0.7]]] * 4, atol=1e-6)
 
 
+@SLOW
+@pytest.mark.timeout(1800)
 def test_an_update_is_sound(family: Trainer):
     """It can be traced, and gives back a state of the same kind."""
     key = jax.random.key(0)

@@ -9,7 +9,10 @@ from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 from physics_cases import PLAIN, ROWS, c_loop, flat, make_case, run_alone, toy
 
-from jaxskills import character, physics
+from jaxskills import character, clip, physics, pose, retarget
+from jaxskills.env import obstacles, task
+from jaxskills.env.holds import Grip
+from jaxskills.env.task import TaskSpec
 from jaxskills.errors import UserError
 from jaxskills.physics import box_floor, explicit
 
@@ -22,6 +25,15 @@ def test_mjx_names_what_it_cannot_vary():
     masked.geom_contype[1] = 1
     with pytest.raises(UserError, match="geom_contype"):
         engine.load([toy(), masked])
+
+
+def test_sizes_of_geoms_may_differ():
+    engine = physics.make("mjx", 1, num_envs=1)
+    larger = toy()
+    larger.geom_size[1] = 0.2
+    larger.geom_rbound[1] = 0.2
+    loaded = engine.load([toy(), larger])
+    assert [leaf.shape[0] for leaf in loaded.varied] == [2, 2]
 
 
 BOX = """
@@ -100,6 +112,35 @@ def test_discrete_on_the_floor_is_close():
     assert np.median(error) < 0.1 * np.median(before)
 
 
+@pytest.fixture(scope="module")
+def hanging() -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
+    """A humanoid with its hands on a bar, a block under it; its pose, and controls that keep it."""
+    who = character.load("humanoid34")
+    grip = Grip(("left_wrist", "right_wrist"), 0.0, 1.0)
+    objects = (
+        obstacles.bar((0.56, 0.0), 2.3, grip=grip),
+        obstacles.box((0.75, 0.0), (0.5, 1.2), 0.3),
+    )
+    model = task.placed(TaskSpec(objects=objects), who).model
+    qpos = retarget.retarget(who, clip.load("swing"))[30]
+    targets = pose.rotation_vectors(who.layout, jnp.asarray(qpos))[who.actuated]
+    return model, qpos, np.concatenate((np.ones(6), np.asarray(targets)))
+
+
+def test_what_hands_hold_is_close(hanging: tuple[mujoco.MjModel, np.ndarray, np.ndarray]):
+    """The pull is that of the beginning of each step: half a second of hanging and swinging."""
+    model, qpos, ctrl = hanging
+    ends = []
+    for one in (model, explicit.from_discrete(model)):
+        data = mujoco.MjData(one)
+        data.qpos[:], data.ctrl[:] = qpos, ctrl
+        mujoco.mj_step(one, data, 60)
+        ends.append(data.qpos.copy())
+        assert np.abs(data.body("left_wrist").xpos[[0, 2]] - [0.56, 2.3]).max() < 0.05
+    assert np.abs(ends[0] - qpos).max() > 0.02
+    np.testing.assert_allclose(ends[1], ends[0], atol=5e-3)
+
+
 def test_discrete_refuses_what_it_cannot_express():
     text = "<mujoco><worldbody><body><joint name='j' stiffness='1'/><geom size='1'/></body>"
     sprung = mujoco.MjModel.from_xml_string(text + "</worldbody></mujoco>")
@@ -122,6 +163,21 @@ def test_the_shipped_humanoid_in_mjx_follows_c():
     expected = [c_loop(model, qpos[i], qvel[i], ctrl[:, i]) for i in range(ROWS)]
     error = np.abs(flat(state) - np.stack(expected))
     assert error[:, : model.nq].max() < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_hands_hold_a_bar_in_mjx(hanging: tuple[mujoco.MjModel, np.ndarray, np.ndarray]):
+    model, one, target = hanging
+    case = make_case("mjx", [model])
+    qpos = np.tile(one, (ROWS, 1)).astype(np.float32)
+    qvel = np.zeros((ROWS, model.nv), np.float32)
+    ctrl = np.tile(target, (3, ROWS, 1)).astype(np.float32)
+    state = case.start(qpos, qvel, PLAIN)
+    for control in ctrl:
+        state = case.step(case.loaded, PLAIN, state, control)
+    expected = np.stack([c_loop(model, qpos[i], qvel[i], ctrl[:, i]) for i in range(ROWS)])
+    assert np.abs(flat(state) - expected)[:, : model.nq].max() < 0.01
 
 
 CROWD = """

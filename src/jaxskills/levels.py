@@ -24,7 +24,8 @@ def raised(character: Character, motion: Motion) -> Motion:
     if own[1].boxes is None:
         return motion
     tree = kinematics.tree(character.model)
-    floor, top = jit(lambda: _heights(tree, motion, own))()[0]
+    first = dataclasses.replace(motion, qpos=motion.qpos[:1], qvel=motion.qvel[:1])
+    floor, top = jit(lambda: _heights(tree, first, own))()[0]
     return dataclasses.replace(motion, qpos=motion.qpos.at[:, 2].add(floor - top))
 
 

@@ -9,7 +9,6 @@ lost its hold. All numbers are in the model, so films and variants need nothing 
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +73,7 @@ def add(
     character: Character,
     grip: Grip,
     name: str,
-    middle: Sequence[float],
+    middle: np.ndarray,
     length: float,
 ) -> None:
     """Adds what holds hands at a bar across x.

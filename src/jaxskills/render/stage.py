@@ -106,7 +106,7 @@ def opened(
         last_first.callback(gl.make_current)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
         scene = mujoco.MjvScene(solid, maxgeom=2 * model.ngeom + _MAX_TILES + 1000)
-        figures = [mujoco.MjData(one) for one in (solid, ghost, _scenery(solid))]
+        figures = mujoco.MjData(solid), mujoco.MjData(ghost), mujoco.MjData(_scenery(solid))
         yield Stage(*figures, lens, width, height, body, floor, scene, context, gl)
 
 
