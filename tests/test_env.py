@@ -385,6 +385,23 @@ def _random_states(who: Character, count: int) -> tuple[np.ndarray, np.ndarray, 
     return rows[0], rng.normal(0, 6.0, (count, who.layout.nv)), rows[1]
 
 
+def test_without_limits_servos_have_any_strength(who: Character, walk: Motion):
+    """A push by 2 rad, at a hip of 80 N m/rad that is limited to 40 N m."""
+    push = np.zeros(5, np.float32)
+    push[3] = 2.0
+    largest = []
+    for limited in (True, False):
+        made = _running(tiny.make_env(who, walk, EnvConfig(torque_limits=limited)))
+        state, outcome = made.step(made.start(jnp.float32(3.0)), push)
+        largest.append(np.abs(np.asarray(outcome.report.torque)).max())
+        swung = float(state.sim.qpos[tiny.LEFT_HIP])
+    assert largest[0] <= 40.0 * (1 + 1e-4)
+    assert largest[1] > 60.0 and swung > 0.5
+    servos = servo.of(who)
+    assert (servo.unlimited(servos).torque == jnp.inf).all()
+    assert servo.unlimited(servos).kp is servos.kp
+
+
 def test_torques_are_within_their_limits(who: Character):
     servos, layout = servo.of(who), who.layout
     qpos, qvel, target = (jnp.asarray(x, jnp.float32) for x in _random_states(who, 200))

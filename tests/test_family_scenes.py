@@ -35,7 +35,7 @@ SPEC = TaskSpec(
         ),
         Parameter("far", (1.0, 1.0), measure=_ALONG, strict=True),
     ),
-    objects=(
+    scenery=(
         obstacles.box((0.0, 0.0), (0.6, 1.0), 0.0, "first"),
         obstacles.box((1.0, 0.0), (0.6, 1.0), 0.0, "second"),
         obstacles.bar((0.25, 0.0), 0.7, grip=Grip(("torso",), 0.4, 0.6)),
@@ -91,7 +91,7 @@ def test_a_skill_among_objects(tmp_path: Path):
     """A task without parameters is one skill, and its reference begins on what stands there."""
     objects = (obstacles.box((0.0, 0.0), (0.6, 1.0), 0.3),)
     config = tiny.train_config(tmp_path)
-    made = families.make(config, TaskSpec(objects=objects))
+    made = families.make(config, TaskSpec(scenery=objects))
     assert made.world is None
     assert [made.character.model.geom("box").pos[0]] == [0.0]
     plain = families.make(config)

@@ -208,7 +208,7 @@ def test_a_lift_of_ground_and_motion_counts_nothing(who: Character, bow: Motion,
     qpos, qvel = _faulty(who, bow, 3, 0.1)
     here = judge(_episode(bow, qpos, qvel))
     box = obstacles.box((0.0, 0.0), (20.0, 20.0), 0.7)
-    among = placed(TaskSpec(objects=(box,)), who).model
+    among = placed(TaskSpec(scenery=(box,)), who).model
     own = kinematics.body_params(among), ground.shapes(among)
     compiled = jax.jit(lib.make(who, bow, CONFIG))
     for lift, same in ((0.7, True), (0.5, False)):

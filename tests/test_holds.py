@@ -25,7 +25,7 @@ GRIP = Grip(("left_wrist", "right_wrist"), begin=0.3, end=0.6)
 
 
 def _holding(who: Character, grip: Grip, height: float = 2.3) -> Character:
-    return task.placed(TaskSpec(objects=(obstacles.bar((0.56, 0.0), height, grip=grip),)), who)
+    return task.placed(TaskSpec(scenery=(obstacles.bar((0.56, 0.0), height, grip=grip),)), who)
 
 
 @pytest.fixture(scope="module")

@@ -20,12 +20,13 @@ clip.data clip.roles clip.deepmimic clip.bvh clip.keyframes clip
 character
 retarget.hinges retarget.posed retarget.mapping retarget
 check.measures check.repairs check.faults check
-kinematics terrain ground motion levels variation trace
+kinematics terrain ground motion objects levels variation trace
 
 physics.quiet physics.ffi physics.base physics.cpu physics.box_floor physics.explicit
 physics.mjx physics.servo physics
 env.observe env.bounds env.bounds_file env.rewards env.tracking env.style env.gram
-env.holds env.variants env.measure env.task env.conditions env.obstacles env.worlds env.core env
+env.holds env.variants env.measure env.task env.conditions env.obstacles env.push env.strike
+env.worlds env.core env
 learn.networks learn.normalize learn.windows learn.autoencoder learn.gae learn.ppo learn.rollout
 learn
 explore.starts explore.evolution explore.adaptive explore.refine explore.fitness explore.elites

@@ -41,7 +41,7 @@ def test_a_motion_is_higher_by_the_box_that_it_begins_on(
 ):
     box = obstacles.box((x, 0.0), (1.0, 1.0), height)
     motion = _motion(plain)
-    found = levels.raised(task.placed(TaskSpec(objects=(box,)), plain), motion)
+    found = levels.raised(task.placed(TaskSpec(scenery=(box,)), plain), motion)
     np.testing.assert_allclose(found.qpos[:, 2], motion.qpos[:, 2] + raised, atol=1e-6)
     np.testing.assert_array_equal(found.qpos[:, :2], motion.qpos[:, :2])
     np.testing.assert_array_equal(found.qvel, motion.qvel)
@@ -71,7 +71,7 @@ def test_variants_begin_on_boxes_of_their_own(plain: Character):
 
 
 def test_a_box_that_all_begin_on_counts_once(plain: Character):
-    among = task.placed(TaskSpec(objects=(obstacles.box((0.0, 0.0), (1.0, 1.0), 0.3),)), plain)
+    among = task.placed(TaskSpec(scenery=(obstacles.box((0.0, 0.0), (1.0, 1.0), 0.3),)), plain)
     found = _variants(among, conditions.gravity, (0.5, 1.0))
     expected = _motion(plain).qpos[:, 2] + 0.3
     np.testing.assert_allclose(found.qpos[:, :, 2], np.tile(expected, (2, 1)), atol=1e-6)

@@ -24,7 +24,7 @@ def who() -> Character:
 
 
 def _among(who: Character, *objects: Condition) -> mujoco.MjModel:
-    return task.placed(TaskSpec(objects=objects), who).model
+    return task.placed(TaskSpec(scenery=objects), who).model
 
 
 def _partners(model: mujoco.MjModel, name: str) -> list[str]:
@@ -82,7 +82,7 @@ def test_factors_change_heights_and_places(who: Character):
             Parameter("place", (1.0, 3.0), condition=obstacles.moved("two", (0.5, 0.25))),
             Parameter("step", (-1.0, 1.0), condition=obstacles.step("two", "three")),
         ),
-        objects=(
+        scenery=(
             obstacles.box((2, 0), (1, 1), 0.0, "two"),
             obstacles.box((3, 0), (1, 1), 0.0, "three"),
         ),

@@ -121,7 +121,7 @@ def hanging() -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
         obstacles.bar((0.56, 0.0), 2.3, grip=grip),
         obstacles.box((0.75, 0.0), (0.5, 1.2), 0.3),
     )
-    model = task.placed(TaskSpec(objects=objects), who).model
+    model = task.placed(TaskSpec(scenery=objects), who).model
     qpos = retarget.retarget(who, clip.load("swing"))[30]
     targets = pose.rotation_vectors(who.layout, jnp.asarray(qpos))[who.actuated]
     return model, qpos, np.concatenate((np.ones(6), np.asarray(targets)))

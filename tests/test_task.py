@@ -116,7 +116,7 @@ def test_objects_stand_there_whatever_the_parameters(who: Character):
         assert factor == 1.0
         spec.option.gravity = [0.0, 0.0, -4.0]
 
-    spec = TaskSpec((GRAVITY,), objects=(halved,))
+    spec = TaskSpec((GRAVITY,), scenery=(halved,))
     among = task.placed(spec, who)
     assert among.model.opt.gravity[2] == -4.0 and who.model.opt.gravity[2] == -9.81
     assert task.variant(spec, among, np.array([1.0])).model.opt.gravity[2] == -8.0

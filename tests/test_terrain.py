@@ -118,7 +118,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Character:
 @pytest.fixture(scope="module")
 def who(plain: Character) -> Character:
     """A walker behind whom a box of 0.3 m stands, from x = -1.5 to -0.5."""
-    return placed(TaskSpec(objects=(obstacles.box((-1.0, 0.0), (1.0, 1.0), 0.3),)), plain)
+    return placed(TaskSpec(scenery=(obstacles.box((-1.0, 0.0), (1.0, 1.0), 0.3),)), plain)
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +200,7 @@ def test_a_ball_comes_to_rest_on_a_box(tmp_path):
     ball = character.load(str(path))
     for top in (0.0, 0.05, 0.7):
         box = obstacles.box((0.0, 0.0), (1.0, 1.0), top)
-        model = placed(TaskSpec(objects=(box,)), ball).model
+        model = placed(TaskSpec(scenery=(box,)), ball).model
         data = mujoco.MjData(model)
         for _ in range(240):
             mujoco.mj_step(model, data)

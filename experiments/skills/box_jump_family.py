@@ -39,7 +39,7 @@ RECIPE = Recipe(
                 relative=False,
             ),
         ),
-        objects=(_FIRST, _SECOND),
+        scenery=(_FIRST, _SECOND),
     ),
     config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
 )

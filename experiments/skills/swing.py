@@ -16,7 +16,7 @@ RECIPE = Recipe(
     clip="swing",
     note="Our own clip; the bar is 2.3 m high, the block under it 0.3 m.",
     task=TaskSpec(
-        objects=(
+        scenery=(
             obstacles.bar((0.56, 0.0), 2.3, grip=_GRIP),
             obstacles.box((0.75, 0.0), (0.5, 1.2), 0.3, "block"),
         )

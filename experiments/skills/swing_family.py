@@ -34,7 +34,7 @@ RECIPE = Recipe(
                 strict=True,
             ),
         ),
-        objects=(obstacles.bar((0.56, 0.0), 2.3, grip=_GRIP),),
+        scenery=(obstacles.bar((0.56, 0.0), 2.3, grip=_GRIP),),
     ),
     config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
 )

@@ -11,7 +11,7 @@ RECIPE = Recipe(
     name="wall_jump",
     clip="wall_jump",
     note="Our own clip; the wall is 0.9 m high and 0.2 m thick.",
-    task=TaskSpec(objects=(obstacles.box((1.4, 0.0), (0.2, 1.2), 0.9, "wall"),)),
+    task=TaskSpec(scenery=(obstacles.box((1.4, 0.0), (0.2, 1.2), 0.9, "wall"),)),
     config=TrainConfig(
         env=EnvConfig(may_touch=("left_ankle", "right_ankle", "left_wrist", "right_wrist"))
     ),

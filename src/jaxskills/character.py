@@ -10,6 +10,7 @@ import dataclasses
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -42,6 +43,18 @@ class Gains:
     weight: float = 1.0  # of this joint in the imitation reward
 
 
+class Object(NamedTuple):
+    """A thing that moves beside a character: a body of the same model, see `objects.py`."""
+
+    name: str  # of its body
+    # (spec) -> adds that body with k slide joints to the world, what it touches, X actuators
+    build: Callable[[mujoco.MjSpec], None]
+    # (character, motion) -> [F, k] its joints along the reference. None: it is parked, all are 0
+    path: Callable[..., np.ndarray] | None = None
+    # (character, length) -> (sim, body, phase, dphase) -> sim, controls [X]; see `objects.Scene`
+    act: Callable[..., Callable[..., Any]] | None = None
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Character:
     """A character on the host. N bodies (the world left out), nu actuated degrees of freedom."""
@@ -60,12 +73,15 @@ class Character:
     ground: tuple[str, ...]  # bodies that may touch the ground without it being a fall
     forward: np.ndarray  # [3] facing at the zero pose
     limits: dict[str, dict[str, tuple[float, float]]]  # rad, information for clip checks
-    scene: tuple[Callable[[mujoco.MjSpec], None], ...] = ()  # puts things around it, when compiled
+    scenery: tuple[
+        Callable[[mujoco.MjSpec], None], ...
+    ] = ()  # puts things around it, when compiled
+    objects: tuple[Object, ...] = ()  # in the order of their joints, after the character's own
 
     @property
     def mass(self) -> float:
-        """Total mass in kg, the floor left out."""
-        return float(self.model.body_mass[1:].sum())
+        """Total mass in kg, the floor and objects left out."""
+        return float(self.model.body_mass[1 : pose.own_bodies(self.model) + 1].sum())
 
     @property
     def weights(self) -> dict[str, float]:
@@ -119,9 +135,10 @@ def load(name: str) -> Character:
         raise UserError(f"character '{path}': its first joint must be free (a floating root)")
     settings = _settings(path.with_suffix(".toml"), model, layout)
     gains = settings["gains"]
-    joints = [joint for joint in layout.joints if joint.name in gains and gains[joint.name].kp > 0]
+    movable = [joint for joint in layout.own.joints if joint.name in gains]
+    joints = [joint for joint in movable if gains[joint.name].kp > 0]
     per_dof = [(dof, gains[joint.name]) for joint in joints for dof in joint.dofs]
-    body_names = tuple(model.body(i).name for i in range(1, model.nbody))
+    body_names = tuple(model.body(i + 1).name for i in range(pose.own_bodies(model)))
     character = Character(
         name=path.stem,
         source=str(path),
@@ -145,14 +162,14 @@ def load(name: str) -> Character:
 
 def placed(
     character: Character,
-    scene: Sequence[Callable[[mujoco.MjSpec], None]],
+    scenery: Sequence[Callable[[mujoco.MjSpec], None]],
     timestep: float = DEFAULT_TIMESTEP,
 ) -> Character:
-    """Returns the character among more things, which `scene` puts into the spec one by one.
+    """Returns the character among more things, which `scenery` puts into the spec one by one.
 
     Whatever is made of it simulates, measures and films it there. Its model has this time step (s).
     """
-    among = dataclasses.replace(character, scene=(*character.scene, *scene))
+    among = dataclasses.replace(character, scenery=(*character.scenery, *scenery))
     return dataclasses.replace(among, model=compile(among, timestep))
 
 
@@ -164,6 +181,8 @@ def compile(  # noqa: A001
 ) -> mujoco.MjModel:
     """Returns the model with one position servo per actuated degree of freedom.
 
+    The actuators of objects come first, then those of its scenery and of `edit`.
+
     `discrete` is implicit in positions and velocities and solves contacts with the same implicit
     mass. `implicitfast`, for engines without it, gets kv = kd + h kp, which has the right hand side
     of stable PD (Tan et al. 2011), but solves contacts as if there were no servos: at 120 Hz feet
@@ -174,8 +193,7 @@ def compile(  # noqa: A001
       character: what to compile.
       timestep: h in s.
       integrator: one of `INTEGRATORS`.
-      edit: changes the spec before servos are added, for a variant of the character. Actuators
-        that it or the character's scene adds come first.
+      edit: changes the spec, objects and scenery included, before servos are added: for a variant.
 
     Raises:
       UserError: unknown integrator.
@@ -183,7 +201,9 @@ def compile(  # noqa: A001
     if integrator not in INTEGRATORS:
         raise unknown("integrator", integrator, INTEGRATORS)
     spec = _bare_spec(Path(character.source))
-    for change in (*character.scene, *(() if edit is None else (edit,))):
+    for thing in character.objects:
+        thing.build(spec)
+    for change in (*character.scenery, *(() if edit is None else (edit,))):
         change(spec)
     spec.option.timestep = timestep
     spec.option.integrator = INTEGRATORS[integrator]
@@ -228,14 +248,15 @@ def _settings(path: Path, model: mujoco.MjModel, layout: pose.Layout) -> dict:
     for key in raw:
         if key not in _TOML_KEYS:
             raise unknown(f"entry in '{path}'", key, _TOML_KEYS)
-    movable = {joint.name: joint for joint in layout.joints if joint.kind != "free"}
+    movable = {joint.name: joint for joint in layout.own.joints if joint.kind != "free"}
     for table in ("gains", "limits"):
         for name in raw.get(table, {}):
             if name not in movable:
                 raise unknown(f"joint in [{table}] of '{path}'", name, movable)
-    kp = _KP_PER_KG * float(model.body_mass.sum())
+    bodies = range(1, pose.own_bodies(model) + 1)
+    kp = _KP_PER_KG * float(model.body_mass[: bodies.stop].sum())
     default = Gains(kp, kp / 10.0, kp)
-    leaves = [i for i in range(1, model.nbody) if not (model.body_parentid[1:] == i).any()]
+    leaves = [i for i in bodies if not (model.body_parentid[1:] == i).any()]
     lowest = _lowest_bodies(model, leaves)
     names = [model.body(i).name for i in range(model.nbody)]
     return {

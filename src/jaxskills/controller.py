@@ -30,6 +30,7 @@ from jaxskills.compilation import jit
 from jaxskills.env import task as task_lib
 from jaxskills.env.core import EnvState
 from jaxskills.env.worlds import World
+from jaxskills.errors import UserError
 from jaxskills.explore import family as family_lib
 from jaxskills.explore.family import Asked, Family
 from jaxskills.families import Parts
@@ -73,9 +74,12 @@ def family_controller(made: Trainer, state: TrainState) -> Controller:
     """Returns the character of a trained family.
 
     Raises:
-      UserError: the run is of one skill.
+      UserError: the run is of one skill, or something moves beside the character, which is where
+        it was left when the next performance begins.
     """
     spec, family = task_of(made), state.family
+    if spec.objects:
+        raise UserError(f"a family with a {spec.objects[0].name} does not go on by itself")
     assert family is not None
     own, world = parts(made, 1)
     conditions = np.array([p.condition is not None for p in spec.free], bool)
@@ -158,7 +162,7 @@ def _reference(own: Parts, playing: Playing) -> jax.Array:
 def _shown(own: Parts, world: World, asked: Asked, phase: jax.Array) -> jax.Array:
     """Returns the pose `[nq]` of the motion m_a."""
     layout = own.character.layout
-    made = variation.unflatten(asked.x[0], layout.nv)
+    made = variation.unflatten(asked.x[0], layout.own.nv)
     shown = variation.displace(layout, jax.tree.map(lambda x: x[0], world.motion), made)
     return motion.sample(layout, shown, phase)[0]
 

@@ -17,8 +17,8 @@ import numpy as np
 from flax import struct
 
 from jaxskills import character as character_lib
+from jaxskills import objects, recipes, trainer
 from jaxskills import physics as physics_lib
-from jaxskills import recipes, trainer
 from jaxskills import variation as variation_lib
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
@@ -60,7 +60,8 @@ def make(config: TrainConfig, spec: TaskSpec | None = None) -> Trainer:
         return trainer.make(config)
     if spec.free:
         return _family(config, spec)
-    return trainer.make(config, task_lib.placed(spec, character_lib.load(config.character)))
+    character = character_lib.load(config.character)
+    return trainer.make(config, task_lib.scenery(spec, character), spec.objects)
 
 
 class Parts(NamedTuple):
@@ -84,7 +85,7 @@ def parts(config: TrainConfig, spec: TaskSpec) -> Parts:
     """
     validate(config)
     character = task_lib.placed(spec, character_lib.load(config.character))
-    shown = trainer.reference(config, character)
+    character, shown = objects.add(character, trainer.reference(config, character), spec.objects)
     task = task_lib.make(spec, character, shown)
     itself = task_lib.variant(spec, character, task.base)
     return Parts(
@@ -102,7 +103,7 @@ def parts(config: TrainConfig, spec: TaskSpec) -> Parts:
 def environment(own: Parts, world: World, asked: family_lib.Asked) -> core.Environment:
     """Returns the environment of a batch of task parameters. Its arrays may be traced."""
     layout, length = own.character.layout, float(own.shown.length)
-    made = variation_lib.unflatten(asked.x, layout.nv)
+    made = variation_lib.unflatten(asked.x, layout.own.nv)
     displace = jax.vmap(functools.partial(variation_lib.displace, layout))
     motions = jax.jit(displace)(world.motion, made)  # on the host too, and at once
     rows = variants.Variant(motions, made, world.body, world.shapes, asked.a, world.holds)
@@ -114,7 +115,7 @@ def environment(own: Parts, world: World, asked: family_lib.Asked) -> core.Envir
 def _family(config: TrainConfig, spec: TaskSpec) -> Trainer:
     own = parts(config, spec)
     reference = jnp.asarray(own.task.base, jnp.float32)
-    size = own.knots * (own.character.layout.nv + 1)
+    size = own.knots * (own.character.layout.own.nv + 1)  # an object's path is not varied
     compiled = worlds.make(
         own.character, own.shown, spec, own.engine, CONTROL_DT / config.env.substeps
     )
@@ -209,7 +210,7 @@ def take_stock(
     assert family is not None
     slot, steps = slots(config), record.phase.shape[0]
     found = episodes.finished(
-        own.character.layout,
+        own.character.layout.own,
         world.motion,
         (world.body, world.shapes),
         own.task,

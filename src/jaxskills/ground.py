@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from jaxskills import rotation, terrain
+from jaxskills import pose, rotation, terrain
 from jaxskills.kinematics import Bodies
 
 _TYPES = mujoco.mjtGeom
@@ -33,8 +33,9 @@ class Shapes:
 
 
 def shapes(model: mujoco.MjModel) -> Shapes:
-    """Returns the shapes of the geoms that can collide with the geom `floor`."""
+    """Returns the shapes of the character's geoms that can collide with the geom `floor`."""
     rows = [g for g in range(model.ngeom) if _meets_floor(model, g)]
+    rows = [g for g in rows if model.geom_bodyid[g] <= pose.own_bodies(model)]
     edge, ellipsoid = np.zeros((len(rows), 3)), np.zeros((len(rows), 3))
     ball, disc = np.zeros(len(rows)), np.zeros(len(rows))
     for i, g in enumerate(rows):

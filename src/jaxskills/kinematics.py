@@ -27,7 +27,10 @@ class Level:
 
 @dataclasses.dataclass(frozen=True)
 class Tree:
-    """The static structure: levels of links, and the last link of each of the N bodies."""
+    """The static structure: levels of links, and the last link of each of the N bodies.
+
+    The character's only: objects are no bodies here, so neither masses nor places of theirs count.
+    """
 
     layout: pose.Layout
     levels: tuple[Level, ...]
@@ -62,9 +65,10 @@ class Bodies:
 
 
 def tree(model: mujoco.MjModel) -> Tree:
-    """Returns the static structure of a compiled model."""
+    """Returns the static structure of a compiled model: of its character, without objects."""
     depth, links, last = [], [], {0: -1}
-    for body in range(1, model.nbody):
+    count, layout = pose.own_bodies(model), pose.Layout.of(model).own
+    for body in range(1, count + 1):
         first = int(model.body_jntadr[body])
         joints = list(range(first, first + int(model.body_jntnum[body]))) or [-1]
         parent = last[int(model.body_parentid[body])]
@@ -80,28 +84,29 @@ def tree(model: mujoco.MjModel) -> Tree:
         rows = [links[i] for i in order if depth[i] == level]
         parents, bodies, joints = zip(*rows, strict=True)
         levels.append(Level(tuple(place[p] for p in parents), bodies, joints))
-    ends = tuple(place[last[body]] for body in range(1, model.nbody))
-    layout = pose.Layout.of(model)
+    ends = tuple(place[last[body]] for body in range(1, count + 1))
     slides = any(joint.kind == "slide" for joint in layout.joints)
-    return Tree(layout, tuple(levels), ends, slides or bool(model.jnt_pos.any()))
+    beside = model.jnt_pos[: len(layout.joints)].any()
+    return Tree(layout, tuple(levels), ends, slides or bool(beside))
 
 
 def body_params(model: mujoco.MjModel) -> BodyParams:
-    """Returns the numbers of a compiled model as float32 arrays."""
+    """Returns the numbers of a compiled model as float32 arrays, without those of objects."""
+    bodies, joints = slice(0, pose.own_bodies(model) + 1), len(pose.Layout.of(model).own.joints)
     with_zero = lambda rows: np.concatenate((rows, np.zeros((1, 3))))  # noqa: E731
     pos, quat = model.body_pos.copy(), model.body_quat.copy()
     # A free joint replaces its body's own offset.
     free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
     pos[free], quat[free] = 0.0, (1.0, 0.0, 0.0, 0.0)
     fields = (
-        pos,
-        _matrices(quat),
-        with_zero(model.jnt_pos),
-        with_zero(model.jnt_axis),
-        model.body_mass[1:],
-        model.body_ipos[1:],
-        model.body_inertia[1:],
-        _matrices(model.body_iquat[1:]),
+        pos[bodies],
+        _matrices(quat[bodies]),
+        with_zero(model.jnt_pos[:joints]),
+        with_zero(model.jnt_axis[:joints]),
+        model.body_mass[bodies][1:],
+        model.body_ipos[bodies][1:],
+        model.body_inertia[bodies][1:],
+        _matrices(model.body_iquat[bodies][1:]),
     )
     return BodyParams(*(jnp.asarray(field, jnp.float32) for field in fields))
 

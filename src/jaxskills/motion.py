@@ -107,12 +107,13 @@ def fold(
     """Returns a state `[nq]`, `[nv]` and its `phase []` moved back into the first cycle.
 
     It is turned back by the yaw of the cycles gone by, and its root is put on the reference's,
-    horizontally, so what it had drifted is forgiven. A motion without loop has one cycle.
+    horizontally, so what it had drifted is forgiven, unless there are objects to be met at their
+    places. A motion without loop has one cycle.
     """
     cycle = jnp.floor(phase / motion.length) if motion.loop else jnp.zeros_like(phase)
     inside = jnp.clip(phase - cycle * motion.length, 0.0, motion.length)
     back = rotation.about_z(-cycle * motion.cycle_yaw)
-    at = sample(layout, motion, inside)[0][:2]
+    at = qpos[:2] if layout.others else sample(layout, motion, inside)[0][:2]
     rot = rotation.mul(back, qpos[3:7])
     qpos = jnp.concatenate((at, qpos[2:3], rot, qpos[7:]))
     return qpos, jnp.concatenate((rotation.rotate(back, qvel[:3]), qvel[3:])), inside

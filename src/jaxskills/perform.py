@@ -124,7 +124,7 @@ def _perform(
         constraint,
         (world.body, world.shapes),
     )
-    varied = variation.unflatten(x, layout.nv)
+    varied = variation.unflatten(x, layout.own.nv)
     shown = jax.vmap(functools.partial(variation.displace, layout))(world.motion, varied)
     at = lambda one, phase: motion.sample(layout, one, phase)[0]  # noqa: E731
     return Performances(

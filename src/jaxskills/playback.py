@@ -12,6 +12,7 @@ from jaxskills.compilation import jit
 from jaxskills.env import bounds
 from jaxskills.evaluate import EvaluateConfig, Trace
 from jaxskills.motion import CONTROL_DT
+from jaxskills.pose import own_bodies
 from jaxskills.trainer import PHASE_BINS, Trainer, TrainState
 
 _AFTER_FALL = 1.0  # s of film after the character has fallen, or the motion is over
@@ -96,7 +97,7 @@ def _places(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     for pose in qpos:
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
-        places.append(data.xipos[1:] - [*pose[:2], 0.0])
+        places.append(data.xipos[1 : own_bodies(model) + 1] - [*pose[:2], 0.0])
     return np.reshape(places, (len(qpos), -1))
 
 
@@ -133,5 +134,5 @@ def _com_height(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        heights.append(data.subtree_com[0, 2])
+        heights.append(data.subtree_com[model.jnt_bodyid[0], 2])
     return np.array(heights)

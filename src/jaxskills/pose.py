@@ -46,6 +46,15 @@ class Layout:
     joints: tuple[Joint, ...]
     nq: int
     nv: int
+    others: int = 0  # how many joints at the end are no joints of the character, but of objects
+
+    @property
+    def own(self) -> "Layout":
+        """The layout of the character alone; its indices hold in whole poses too."""
+        if not self.others:
+            return self
+        first = self.joints[-self.others]
+        return Layout(self.joints[: -self.others], first.qpos, first.dof)
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> "Layout":
@@ -59,7 +68,20 @@ class Layout:
             )
             for i in range(model.njnt)
         )
-        return cls(joints, model.nq, model.nv)
+        others = int((model.jnt_bodyid > own_bodies(model)).sum())
+        return cls(joints, model.nq, model.nv, others)
+
+
+def own_bodies(model: mujoco.MjModel) -> int:
+    """Returns N, how many bodies are the character's; bodies after those are objects.
+
+    The character is the tree that the first joint belongs to. MuJoCo keeps trees together, so its
+    bodies are 1 to N, with what stands fixed before it in the file.
+    """
+    if not model.njnt:
+        return model.nbody - 1
+    root = model.body_rootid[model.jnt_bodyid[0]]
+    return int(np.flatnonzero(model.body_rootid == root)[-1])
 
 
 def _addresses(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -96,7 +96,7 @@ def trace_to_variation(
     episode in which one jumps by more than half a turn between two rows is said to cover nothing.
 
     Args:
-      layout: of the poses.
+      layout: of what varies: `Layout.own` leaves objects out, which are no part of a motion.
       motion: the reference `m_0`.
       qpos: `[T, nq]` simulated poses.
       phase: `[T]` control frames, rising strictly where valid. In a loop the first cycle counts.

@@ -8,19 +8,20 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from flax import struct
 
 from jaxskills import character as character_lib
 from jaxskills import clip as clip_lib
-from jaxskills import levels, pose, retarget
+from jaxskills import levels, objects, pose, retarget
 from jaxskills import motion as motion_lib
 from jaxskills import physics as physics_lib
-from jaxskills.character import Character
+from jaxskills.character import Character, Object
 from jaxskills.env import bounds as bounds_lib
 from jaxskills.env import core, gram, variants
 from jaxskills.env.task import TaskSpec
@@ -141,8 +142,17 @@ def style(config: TrainConfig, character: Character, motion: Motion, clip: str) 
     return gram.make(character, motion, shown, encode, model.width, wanted.look_back)
 
 
-def make(config: TrainConfig, character: Character | None = None) -> Trainer:
+def make(
+    config: TrainConfig,
+    scenery: Sequence[Callable[[mujoco.MjSpec], None]] = (),
+    things: Sequence[Object] = (),
+) -> Trainer:
     """Returns the trainer of a configuration.
+
+    Args:
+      config: all settings.
+      scenery: puts what stands around the character into the spec.
+      things: move beside it.
 
     Args:
       config: all settings.
@@ -152,8 +162,8 @@ def make(config: TrainConfig, character: Character | None = None) -> Trainer:
       UserError: a value out of range, an unknown name, a broken clip or character.
     """
     validate(config)
-    character = character_lib.load(config.character) if character is None else character
-    motion = reference(config, character)
+    character = character_lib.placed(character_lib.load(config.character), scenery)
+    character, motion = objects.add(character, reference(config, character), things)
     env = environment(config, character, motion, config.envs)
     obs_size = jax.eval_shape(lambda: env.observe(env.start(jnp.float32(0.0)))).shape[0]
     nets = networks_lib.make(config.networks, obs_size, env.action_size, config.ppo.discount)
@@ -252,7 +262,8 @@ def refined(made: Trainer) -> Trainer:
     """
     env = made.config.env
     finer = dataclasses.replace(env, substeps=env.substeps * made.config.refine.factor)
-    return make(dataclasses.replace(made.config, env=finer), made.character)
+    scene = made.character.scenery, made.character.objects
+    return make(dataclasses.replace(made.config, env=finer), *scene)
 
 
 def to_batch(

@@ -69,10 +69,13 @@ def displace(layout: pose.Layout, motion: Motion, variation: Variation) -> Motio
 
     Its velocities are those of its performance, per second: how the displaced pose changes along
     phase, times the speed of phase. Its length stays one of phase; `duration` has the seconds.
+    Where the displacement is one of the character alone (`Layout.own`), objects keep their paths.
     """
     variation, step = _performed(motion, variation)
     share = jnp.linspace(0.0, 1.0, motion.qpos.shape[0])
     d = _between(variation.d, share)
+    if d.shape[1] < layout.nv:
+        d = jnp.pad(d, ((0, 0), (0, layout.nv - d.shape[1])))
     slope = _slopes(motion, d, step)
     qpos = pose.plus(layout, motion.qpos, d)
 

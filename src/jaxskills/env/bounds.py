@@ -6,6 +6,7 @@ its size. Channels are named, so that training can say which bound ended an epis
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 
 import jax
@@ -46,7 +47,11 @@ class BoundsConfig:
 
 @struct.dataclass
 class Bounds:
-    """Sizes over P knots of phase. K channels: CoM x, y, up, root, joints, end effectors."""
+    """Sizes over P knots of phase.
+
+    K channels: CoM x, y, up, root, joints, end effectors, and last the joints of objects, which are
+    open unless `BoundsConfig.channels` names them.
+    """
 
     sizes: jax.Array  # [P, K] m or rad
     names: tuple[str, ...] = struct.field(pytree_node=False)  # K channels
@@ -55,24 +60,27 @@ class Bounds:
 
 def channel_names(character: Character) -> tuple[str, ...]:
     """Returns the K channel names of a character, in the order of `errors`."""
-    joints = tuple(joint.name for joint in character.layout.joints[1:])
-    return (*_COM, "root", *joints, *(f"{name}_position" for name in character.end_effectors))
+    own, others = _joints(character.layout)
+    effectors = (f"{name}_position" for name in character.end_effectors)
+    return (*_COM, "root", *(j.name for j in own), *effectors, *(j.name for j in others))
 
 
 def channel_units(character: Character) -> tuple[str, ...]:
     """Returns the K units of a character's channels, `m` or `rad`."""
-    joints, effectors = len(character.layout.joints) - 1, len(character.end_effectors)
-    return (*("m",) * len(_COM), "rad", *("rad",) * joints, *("m",) * effectors)
+    (own, others), effectors = _joints(character.layout), len(character.end_effectors)
+    lengths = effectors + len(others)
+    return (*("m",) * len(_COM), "rad", *("rad",) * len(own), *("m",) * lengths)
 
 
 def default_sizes(character: Character, config: BoundsConfig) -> tuple[float, ...]:
     """Returns the K sizes that hold where `config.channels` names no other."""
-    joints, effectors = len(character.layout.joints) - 1, len(character.end_effectors)
+    (own, others), effectors = _joints(character.layout), len(character.end_effectors)
     return (
         *config.com,
         config.root,
-        *(config.joints,) * joints,
+        *(config.joints,) * len(own),
         *(config.end_effectors,) * effectors,
+        *(math.inf,) * len(others),
     )
 
 
@@ -131,7 +139,7 @@ def errors(
     """Returns the error `[K]` of each channel (SB section 5.1).
 
     Args:
-      layout: of the poses.
+      layout: of the poses, with objects.
       offset: `[nv]` displacement from the simulated pose to the reference.
       bodies: the simulated bodies.
       reference: the reference's bodies at the same phase.
@@ -139,9 +147,11 @@ def errors(
     """
     com = jnp.abs(bodies.com - reference.com)
     root = jnp.linalg.norm(offset[3:6], keepdims=True)
-    joints = [jnp.linalg.norm(offset[np.array(j.dofs)]) for j in layout.joints[1:]]
+    own, others = _joints(layout)
+    joints = [jnp.linalg.norm(offset[np.array(j.dofs)]) for j in own]
     distance = jnp.linalg.norm(effectors[0] - effectors[1], axis=-1)
-    return jnp.concatenate((com, root, jnp.stack(joints), distance))
+    beside = [jnp.abs(offset[j.dof])[None] for j in others]
+    return jnp.concatenate((com, root, jnp.stack(joints), distance, *beside))
 
 
 def heading_effectors(bodies: Bodies, indices: tuple[int, ...], axis: jax.Array) -> jax.Array:
@@ -149,6 +159,12 @@ def heading_effectors(bodies: Bodies, indices: tuple[int, ...], axis: jax.Array)
     frame = rotation.heading(bodies.rot[0], axis)
     origin = bodies.pos[0] * jnp.array([1.0, 1.0, 0.0])
     return rotation.turn_back(frame, bodies.pos[np.array(indices, int)] - origin)
+
+
+def _joints(layout: pose.Layout) -> tuple[tuple[pose.Joint, ...], tuple[pose.Joint, ...]]:
+    """Returns the joints of the character besides its root, and those of objects."""
+    own = len(layout.own.joints)
+    return layout.joints[1:own], layout.joints[own:]
 
 
 def _knots(name: str, size: Size) -> tuple[np.ndarray, np.ndarray]:

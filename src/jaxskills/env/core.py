@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxskills import ground, kinematics, pose
+from jaxskills import ground, kinematics, objects, pose
 from jaxskills import variation as variation_lib
 from jaxskills.character import Character
 from jaxskills.env import bounds as bounds_lib
@@ -62,6 +62,7 @@ class EnvConfig:
     style: style_lib.StyleConfig = style_lib.StyleConfig()
     style_weight: float = 0.5  # of the style in a blend, w_s of SB eq. 13
     stop: Literal["bounds", "fall"] = "bounds"  # what ends an episode; DeepMimic: a fall
+    torque_limits: bool = True  # off: servos of any strength, FS section 7.4
     once: bool = False  # an episode is over soon after the first cycle of a motion that loops
     may_touch: tuple[str, ...] | None = None  # bodies that may touch the ground; None: the feet
     heading: Literal["forward", "lateral"] = "forward"  # lateral for backflips and rolls, SB 4.1
@@ -129,6 +130,7 @@ class _Seen(NamedTuple):
     offset: jax.Array
     velocity_error: jax.Array
     effectors: tuple[jax.Array, jax.Array]
+    whole: jax.Array  # the offset with that of objects
 
 
 def make(
@@ -156,6 +158,7 @@ def make(
         raise UserError(f"env.style.style is {config.style.style}: only gram comes with a style")
     layout, tree = character.layout, kinematics.tree(character.model)
     servos, weights = servo.of(character), rewards.imitation_weights(character)
+    servos = servos if config.torque_limits else servo.unlimited(servos)
     effectors = tuple(character.body(name) for name in character.end_effectors)
     forward = character.forward / np.linalg.norm(character.forward)
     lateral = np.cross([0.0, 0.0, 1.0], forward)
@@ -168,6 +171,8 @@ def make(
     neutral = jnp.asarray(character.model.qpos0, jnp.float32)
     max_steps = round(config.seconds / CONTROL_DT)
     length, loop = variants.length, variants.loop
+    scene = objects.scene(character, length)
+    mine = lambda x: x if scene is None else x[: layout.own.nv]  # noqa: E731  no objects
     end = math.inf if loop and not config.once else length + _HOLD
     endings = (*bounds.names, *OTHER_ENDINGS)
 
@@ -179,8 +184,8 @@ def make(
         pair = jax.vmap(lambda q, v: kinematics.kinematics(tree, own.body, q, v))(*both)
         bodies, reference = (jax.tree.map(lambda x: x[i], pair) for i in range(2))  # noqa: B023
         both = [bounds_lib.heading_effectors(b, effectors, axis) for b in (bodies, reference)]
-        offset = pose.minus(layout, ref_qpos, qpos)
-        return _Seen(bodies, reference, offset, ref_qvel - qvel, (both[0], both[1]))
+        whole, error = pose.minus(layout, ref_qpos, qpos), ref_qvel - qvel
+        return _Seen(bodies, reference, mine(whole), mine(error), (both[0], both[1]), whole)
 
     def natural_speed(state: EnvState) -> jax.Array:
         own = pick(variants, state.variant)
@@ -188,6 +193,9 @@ def make(
 
     def features(state: EnvState, seen: _Seen) -> jax.Array:
         parts = [_features(state, seen)]
+        if scene is not None:
+            sim = state.sim
+            parts.append(scene.observe(sim.qpos, sim.qvel, seen.whole, seen.bodies, axis))
         if config.time_warp:
             parts.append(jnp.log(natural_speed(state))[None])
         if task is not None and state.known is not None:
@@ -233,14 +241,17 @@ def make(
         warp = jnp.clip(config.warp_scale * action[-1], *config.warp_limits)
         return natural * jnp.exp(warp), natural
 
-    def grips(state: EnvState) -> jax.Array | None:
-        """Returns the controls of what hands hold, if they may hold anything."""
-        own, sim = pick(variants, state.variant), state.sim
-        if own.holds is None:
-            return None
-        bodies = kinematics.kinematics(tree, own.body, sim.qpos, sim.qvel)
-        within = state.phase % length if loop else state.phase
-        return holds.controls(own.holds, bodies, within / length)
+    def around(state: EnvState, dphase: jax.Array) -> tuple[SimState, list[jax.Array]]:
+        """Returns the simulation with its objects in place, and what they and holds are told."""
+        own, sim, told = pick(variants, state.variant), state.sim, []
+        if scene is not None:
+            sim, more = scene.before(sim, own.body, state.phase, dphase)
+            told.append(more)
+        if own.holds is not None:
+            bodies = kinematics.kinematics(tree, own.body, sim.qpos, sim.qvel)
+            within = state.phase % length if loop else state.phase
+            told.append(holds.controls(own.holds, bodies, within / length))
+        return sim, told
 
     def advance(
         state: EnvState, action: jax.Array, taken: tuple[jax.Array, jax.Array]
@@ -250,16 +261,16 @@ def make(
             own, (chosen, natural) = pick(variants, state.variant), taken
             base, ahead = sample(layout, own.motion, state.phase + config.lead * chosen)
             speed = ahead * (chosen / natural) if config.velocity_feedforward else speed
-        held = grips(state)
         push = action[: len(dofs)]
         target = pose.plus(layout, base, jnp.zeros(layout.nv).at[dofs].set(push))
+        sim, told = around(state, taken[0])
 
         def substep(sim: SimState, _: None) -> tuple[SimState, jax.Array]:
             ctrl = servo.controls(servos, layout, sim.qpos, sim.qvel, target, speed)
-            both = ctrl if held is None else jnp.concatenate((held, ctrl))
-            return physics.step(variants.model, state.variant, sim, both), ctrl
+            whole = jnp.concatenate((*told, ctrl))
+            return physics.step(variants.model, state.variant, sim, whole), ctrl
 
-        sim, ctrl = jax.lax.scan(substep, state.sim, None, length=config.substeps)
+        sim, ctrl = jax.lax.scan(substep, sim, None, length=config.substeps)
         return sim, ctrl[-1]
 
     def imitation(seen: _Seen) -> jax.Array:
@@ -275,7 +286,8 @@ def make(
     def style(own: Variant, seen: _Seen, before: SimState, after: EnvState) -> jax.Array:
         earlier = kinematics.kinematics(tree, own.body, before.qpos, before.qvel)
         change = (after.sim.qvel - before.qvel) / CONTROL_DT
-        joints = jnp.stack([jnp.linalg.norm(change[np.array(j.dofs)]) for j in layout.joints[1:]])
+        rows = [np.array(joint.dofs) for joint in layout.own.joints[1:]]
+        joints = jnp.stack([jnp.linalg.norm(change[row]) for row in rows])
         likeness = None
         if wanted is not None and after.window is not None:
             likeness = gram.reward(wanted, after.window, config.style.gram)
@@ -306,7 +318,10 @@ def make(
             return rate, jnp.float32(0.0), None
         earlier = kinematics.kinematics(tree, own.body, before.sim.qpos, before.sim.qvel)
         shares = before.phase / length, after.phase / length
-        moments = Moment(own.body, earlier), Moment(own.body, seen.bodies)
+        moments = (
+            Moment(own.body, earlier, before.sim.qpos, before.sim.qvel),
+            Moment(own.body, seen.bodies, after.sim.qpos, after.sim.qvel),
+        )
         known, more, spike = task.step(before.known, *moments, shares, own.task)
         return task.tracking_weight * rate + more, spike, known
 
@@ -319,7 +334,7 @@ def make(
         if wanted is not None and state.window is not None:
             window = gram.push(wanted, state.window, own.body, seen.bodies)
             state = dataclasses.replace(state, window=window)
-        errors = bounds_lib.errors(layout, seen.offset, seen.bodies, seen.reference, seen.effectors)
+        errors = bounds_lib.errors(layout, seen.whole, seen.bodies, seen.reference, seen.effectors)
         within = state.phase % length if loop else state.phase
         sizes = bounds_lib.sizes(bounds, within / length)
         sizes = sizes if state.scale is None else state.scale * sizes
@@ -336,15 +351,8 @@ def make(
         by_bound = jnp.where(jnp.any(errors > sizes), worst, others[0])
         ended_by = jnp.where(config.stop == "fall", others[1], by_bound)
         ended_by = jnp.where(diverged, others[2], jnp.where(terminated, ended_by, others[3]))
-        report = Report(
-            errors,
-            sizes,
-            inside,
-            fallen,
-            ended_by,
-            seen.bodies.com,
-            servo.applied_torque(servos, layout, sim.qpos, sim.qvel, ctrl),
-        )
+        torque = servo.applied_torque(servos, layout, sim.qpos, sim.qvel, ctrl)
+        report = Report(errors, sizes, inside, fallen, ended_by, seen.bodies.com, torque)
         rate = jnp.float32(0.0)
         if config.reward == "tracking":
             rate, spike, known = tracked(own, seen, before, state, (dphase, natural))

@@ -113,7 +113,7 @@ def add(
 def of(model: mujoco.MjModel) -> Holds | None:
     """Returns what hands may hold in a model, None if nothing.
 
-    Its controls, three for each hand, are the first ones of the model.
+    Its controls, three for each hand, come before the servos'.
     """
     names = [model.numeric(i).name for i in range(model.nnumeric)]
     names = [name for name in names if name.startswith(_PREFIX)]

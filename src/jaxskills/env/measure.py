@@ -28,6 +28,9 @@ class Moment(NamedTuple):
 
     body: BodyParams
     bodies: Bodies
+    # The whole state, where objects are found; None where there are none.
+    qpos: jax.Array | None = None  # [nq]
+    qvel: jax.Array | None = None  # [nv]
 
 
 Read = Callable[[Moment], jax.Array]  # -> []
@@ -41,6 +44,8 @@ class Measure(NamedTuple):
     quantity: Quantity
     begin: float  # share of the reference
     end: float  # share at which the number is known; `at` has begin equal to end
+    # (character, motion) -> the reference's own number, where a motion cannot be measured by itself
+    reference: Callable[..., float] | None = None
 
 
 def at(share: float, quantity: Quantity) -> Measure:
@@ -148,6 +153,13 @@ def ground_height(character: Character) -> Read:
     """m, of the highest of the bodies that are made to touch the ground, the feet."""
     rows = np.array([character.body(name) for name in character.ground])
     return lambda moment: jnp.max(moment.bodies.pos[rows, 2])
+
+
+def distance(name: str, origin: tuple[float, float]) -> Quantity:
+    """m, how far the centre of a body is from a place `origin` (x, y), seen from above."""
+    return _of_body(
+        name, lambda moment, i: jnp.linalg.norm(_center(moment, i)[:2] - jnp.array(origin))
+    )
 
 
 def _way(angle: float) -> tuple[float, float]:

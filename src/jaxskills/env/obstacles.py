@@ -5,7 +5,7 @@ Each is a condition, so a task parameter can change it, or one of the fixed `obj
 
     TaskSpec(
         (Parameter("height", (0.9, 3.0), condition=obstacles.box((0.5, 0.0), (0.1, 1.2), 0.15)),),
-        objects=(obstacles.bar((0.56, 0.0), 2.3),),
+        scenery=(obstacles.bar((0.56, 0.0), 2.3),),
     )
 
 Whatever its height, a box is in every variant, so that all models have the same sizes: one of no

@@ -29,8 +29,9 @@ _ROOT = {"height": 1.0, "turn": 0.1, "linear": 0.01, "angular": 0.001}
 def imitation_weights(character: Character) -> Imitation:
     """Returns the weights of a character's joints, normalised to sum to 1 with the root's 1."""
     total = 1.0 + sum(character.weights.values())
-    per_dof = np.zeros(character.layout.nv - 6)
-    for joint in character.layout.joints[1:]:
+    layout = character.layout.own
+    per_dof = np.zeros(layout.nv - 6)
+    for joint in layout.joints[1:]:
         per_dof[np.array(joint.dofs) - 6] = character.weights[joint.name] / total
     return Imitation(jnp.asarray(per_dof, jnp.float32), jnp.float32(1.0 / total))
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from jaxskills import character as character_lib
 from jaxskills import kinematics
-from jaxskills.character import Character
+from jaxskills.character import Character, Object
 from jaxskills.compilation import jit
 from jaxskills.env import measure as measure_lib
 from jaxskills.env.measure import Measure, Moment
@@ -64,9 +64,10 @@ class TaskSpec:
     """What a family of skills varies in."""
 
     parameters: tuple[Parameter, ...] = ()
+    scenery: tuple[Condition, ...] = ()  # what stands around, whatever the parameters; factor 1
+    objects: tuple[Object, ...] = ()  # what moves beside the character, see `objects.add`
     spike_weight: float = 10.0  # w_task of FS section 4.2 for spike rewards
     continuous_weight: float = 0.1  # and for continuous ones
-    objects: tuple[Condition, ...] = ()  # what stands around, whatever the parameters; factor 1
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -179,8 +180,13 @@ def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
 
 
 def placed(spec: TaskSpec, character: Character) -> Character:
-    """Returns the character among the objects of a task."""
-    return character_lib.placed(character, [_applied(one, character, 1.0) for one in spec.objects])
+    """Returns the character among the scenery of a task."""
+    return character_lib.placed(character, scenery(spec, character))
+
+
+def scenery(spec: TaskSpec, character: Character) -> list[Callable[[mujoco.MjSpec], None]]:
+    """Returns what puts a task's scenery into the spec of a character."""
+    return [_applied(one, character, 1.0) for one in spec.scenery]
 
 
 def variant(
@@ -193,7 +199,7 @@ def variant(
 
     Args:
       spec: of the task.
-      character: among its objects, see `placed`.
+      character: with what stands and moves around it.
       a: `[P]` the task parameter, normalised.
       timestep: s, of its model.
     """
@@ -222,29 +228,32 @@ def reference_values(spec: TaskSpec, character: Character, motion: Motion) -> np
     def look(share: jax.Array) -> Moment:
         # Just before the end: a motion that does not loop is at rest at its end.
         phase = jnp.minimum(share, 1.0 - 1e-6) * motion.length
-        bodies = kinematics.kinematics(tree, params, *sample(layout, motion, phase))
-        return Moment(params, bodies)
+        state = sample(layout, motion, phase)
+        return Moment(params, kinematics.kinematics(tree, params, *state), *state)
 
     seconds = length * CONTROL_DT / (len(shares) - 1)
     at = jnp.asarray(shares, jnp.float32)
+    made = [_measure(parameter) for parameter in spec.measured]
+    own = {i: one.reference(character, motion) for i, one in enumerate(made) if one.reference}
 
     @jit
-    def values() -> jax.Array:
-        moments, found = jax.vmap(look)(at), []
-        for made in map(_measure, spec.measured):
-            course = jax.vmap(made.quantity(character))(moments)
+    def values() -> list[jax.Array]:
+        moments = jax.vmap(look)(at)
+        courses = [jax.vmap(one.quantity(character))(moments) for one in made]
+        return [_along(one, seconds, of, at) for one, of in zip(made, courses, strict=True)]
 
-            def step(known: jax.Array, pairs, made: Measure = made):
-                (before, after), share = pairs
-                known = measure_lib.update(made, known, before, after, share, seconds)
-                return known, None
+    return np.array([own.get(i, float(value)) for i, value in enumerate(values())], float)
 
-            pairs = (course[:-1], course[1:]), (at[:-1], at[1:])
-            known, _ = jax.lax.scan(step, measure_lib.start(made), pairs)
-            found.append(measure_lib.value(made, known))
-        return jnp.stack(found)
 
-    return np.array(values(), float) if spec.measured else np.zeros(0)
+def _along(made: Measure, seconds: float, course: jax.Array, shares: jax.Array) -> jax.Array:
+    """Returns what a measure `[]` makes of a quantity's `course [S]` at `shares [S]`."""
+
+    def step(known: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:
+        before, after, first, last = row
+        return measure_lib.update(made, known, before, after, (first, last), seconds), None
+
+    rows = course[:-1], course[1:], shares[:-1], shares[1:]
+    return measure_lib.value(made, jax.lax.scan(step, measure_lib.start(made), rows)[0])
 
 
 def normalised(parameter: Parameter, value: float) -> float:

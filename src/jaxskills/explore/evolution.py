@@ -64,13 +64,15 @@ def draw(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Returns phase `[B]`, qpos `[B, nq]` and qvel `[B, nv]` of elites of `segment [B]`.
 
-    The joints get noise; the root does not. The key is consumed.
+    The joints get noise; the root and objects do not. The key is consumed.
     """
     row_key, noise_key = jax.random.split(key)
     row = jax.random.randint(row_key, segment.shape, 0, elites.phase.shape[1])
     qpos, qvel, phase = (x[segment, row] for x in (elites.qpos, elites.qvel, elites.phase))
     d = config.noise * jax.random.normal(noise_key, qvel.shape)
     d = d.at[:, :6].set(0.0)
+    if layout.others:
+        d = d.at[:, layout.own.nv :].set(0.0)
     return phase, jax.vmap(lambda q, move: pose.plus(layout, q, move))(qpos, d), qvel
 
 

@@ -49,7 +49,7 @@ class FitnessConfig:
 class Measures:
     """What fitness looks at, at N knots, of E bodies."""
 
-    qpos: jax.Array  # [N, nq]
+    qpos: jax.Array  # [N, nq]; in this and the next, what comes after the character's own is unread
     qvel: jax.Array  # [N, nv] per second
     height: jax.Array  # [N, E] m, lowest points over the ground
     place: jax.Array  # [N, E, 2] m, where the bodies are horizontally
@@ -81,7 +81,7 @@ def make(character: Character, motion: Motion, config: FitnessConfig) -> Judge:
     """
     validate(config)
     tree, params = kinematics.tree(character.model), kinematics.body_params(character.model)
-    shapes, layout = ground.shapes(character.model), character.layout
+    shapes, layout = ground.shapes(character.model), character.layout.own
     bodies = contact_bodies(character, shapes)
     knots = phases(motion)
 
@@ -163,7 +163,7 @@ def fitness(
 
     Args:
       config: scales.
-      layout: of the poses.
+      layout: of the character's own joints.
       reference: of `m_0`.
       episode: at the same N knots.
       constraint: `[]` r_constraint in [0, 1].
@@ -171,8 +171,8 @@ def fitness(
     count = reference.qpos.shape[0]
     offset = pose.minus(layout, reference.qpos, episode.qpos)[:, 6:]
     joint = _joints(layout)
-    fast = reference.qvel[:, 6:] ** 2 @ joint
-    astray = (reference.qvel - episode.qvel)[:, 6:] ** 2 @ joint
+    fast = reference.qvel[:, 6 : layout.nv] ** 2 @ joint
+    astray = (reference.qvel - episode.qvel)[:, 6 : layout.nv] ** 2 @ joint
     touching = reference.height < config.contact_height
     stays = touching[1:] & touching[:-1]
     slipped = jnp.sum((episode.place[1:] - episode.place[:-1]) ** 2, -1)

@@ -8,6 +8,8 @@ only; from there on damping takes it back as the joint gains speed, so that a jo
 speed by no more than torque/kd, 2.5 rad/s at a shoulder of `humanoid34`, however light the limb is.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -31,6 +33,11 @@ def of(character: Character) -> Servos:
     numbers = (character.kp, character.kd, character.torque)
     dofs = tuple(int(dof) for dof in character.actuated)
     return Servos(*(jnp.asarray(x, jnp.float32) for x in numbers), dofs=dofs)
+
+
+def unlimited(servos: Servos) -> Servos:
+    """Returns the servos without a largest torque, the superhuman of FS section 7.4."""
+    return dataclasses.replace(servos, torque=jnp.full_like(servos.torque, jnp.inf))
 
 
 def controls(
