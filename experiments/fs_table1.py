@@ -29,7 +29,7 @@ SAMPLES = {
     "box_jump": 40_000_000,
     "punch": 40_000_000,
     "push": 20_000_000,
-    "side_kick": 40_000_000,
+    "sidekick": 40_000_000,
     "swing": 20_000_000,
     "wall_jump": 20_000_000,
 }

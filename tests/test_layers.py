@@ -34,7 +34,7 @@ explore.parameterization explore.marginal explore.sampling explore.curriculum ex
 explore.episodes explore
 
 trainer recipes families checkpoint runs evaluate perform evaluate_family controller
-style_measures train
+style_measures judge train
 render.opengl render.stage render.take render.video render.several render.strip render
 plot.sheet plot.states plot.training plot.starts plot.family plot
 task_values playback playback_family provenance

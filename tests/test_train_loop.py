@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import tiny
 
-from jaxskills import checkpoint, clip, evaluate, train, trainer
+from jaxskills import checkpoint, clip, train, trainer
 from jaxskills.errors import UserError
 from jaxskills.learn.networks import NetworkConfig
 from jaxskills.learn.ppo import PPOConfig
@@ -216,36 +216,6 @@ def test_changed_sizes_of_an_update_are_no_way_to_go_back_in_samples(
     assert checkpoint.existing(tmp_path)[-1] == last["samples"]
     assert _samples(tmp_path) == sorted(_samples(tmp_path))
     assert _samples(tmp_path)[:4] == [STEP, 6 * STEP, 11 * STEP, 12 * STEP]
-
-
-def test_a_skill_that_stands_on_coarse_physics_alone_is_not_learnt(
-    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
-):
-    rates = {None: 1.0, evaluate.FINE_SUBSTEPS: 0.969}
-
-    def found(self: Any, state: Any, substeps: int | None) -> tuple[dict[str, float], float]:
-        return {"success_rate": rates[substeps]}, 0.0
-
-    monkeypatch.setattr(train._Judge, "_evaluate", found)
-    judge = train._Judge(trainer.make(dataclasses.replace(config, stop_when_learnt=True)))
-    state: Any = None
-    assert judge(state, 1.0) == {}  # too early to be worth its time
-    assert judge(state, 5.0) == {"success_rate": 1.0, "fine_success_rate": 0.969}
-    assert not judge.learnt
-    rates[evaluate.FINE_SUBSTEPS] = 0.984  # 63 of 64
-    judge(state, 5.0)
-    assert judge.learnt
-
-
-def test_evaluations_wait_unless_survival_has_doubled(
-    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
-):
-    found = {"success_rate": 0.25}
-    monkeypatch.setattr(train._Judge, "_evaluate", lambda *_: (found, 60.0))  # a costly minute
-    judge = train._Judge(trainer.make(dataclasses.replace(config, stop_when_learnt=True)))
-    state: Any = None
-    asked = [bool(judge(state, survival)) for survival in (2.5, 2.5, 4.9, 5.0, 5.0, 9.9, 10.0)]
-    assert asked == [True, False, False, True, False, False, True]
 
 
 @pytest.mark.timeout(300)

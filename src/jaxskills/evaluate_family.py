@@ -7,6 +7,7 @@ measured quantities have errors.
 """
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -95,10 +96,7 @@ def errors(spec: TaskSpec, asked: np.ndarray, met: np.ndarray) -> dict[str, dict
     for, or in the unit of the range.
     """
     found = {}
-    for i, parameter in enumerate(spec.free):
-        if parameter.measure is None:
-            continue
-        wanted, got = (_values(parameter, x[:, i]) for x in (asked, met))
+    for parameter, wanted, got in _pairs(spec, asked, met):
         off = np.abs(got - wanted) / (np.abs(wanted) if parameter.relative else 1.0)
         found[parameter.name] = {
             "mean": float(off.mean()),
@@ -106,6 +104,26 @@ def errors(spec: TaskSpec, asked: np.ndarray, met: np.ndarray) -> dict[str, dict
             "relative": parameter.relative,
         }
     return found
+
+
+def shares(made: Trainer, asked: np.ndarray, met: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns by measured parameter how far each of `met [E, P]` is from `asked [E, P]`.
+
+    As a share of what was asked for, or of the range where that is absolute.
+    """
+    return {
+        p.name: np.abs(got - wanted) / (np.abs(wanted) if p.relative else p.range[1] - p.range[0])
+        for p, wanted, got in _pairs(task_of(made), asked, met)
+    }
+
+
+def _pairs(
+    spec: TaskSpec, asked: np.ndarray, met: np.ndarray
+) -> Iterator[tuple[Parameter, np.ndarray, np.ndarray]]:
+    """Yields the measured parameters with the values `[E]` that were asked for, and came of it."""
+    for i, parameter in enumerate(spec.free):
+        if parameter.measure is not None:
+            yield parameter, _values(parameter, asked[:, i]), _values(parameter, met[:, i])
 
 
 def explored(made: Trainer, state: TrainState) -> tuple[float, dict[str, list[float] | None]]:

@@ -59,10 +59,25 @@ def perform(
     Raises:
       UserError: the run is of one skill, or a value out of range.
     """
-    asked = np.asarray(a, np.float32)
-    own, world = parts(made, len(asked), substeps)
+    return make(made, len(a), substeps)(state, a)
+
+
+def make(
+    made: Trainer, count: int, substeps: int | None = None
+) -> Callable[[TrainState, np.ndarray], Performances]:
+    """Returns `perform` for E = `count` task parameters at a time, which compiles once.
+
+    Raises:
+      UserError: as `perform`.
+    """
+    own, world = parts(made, count, substeps)
     run = jit(functools.partial(_perform, own, made.networks))
-    return run(state, world(asked), asked)
+
+    def performances(state: TrainState, a: np.ndarray) -> Performances:
+        asked = np.asarray(a, np.float32)
+        return run(state, world(asked), asked)
+
+    return performances
 
 
 def task_of(made: Trainer) -> TaskSpec:

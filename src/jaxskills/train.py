@@ -19,7 +19,8 @@ import jax
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from jaxskills import checkpoint, evaluate, families, paths, trainer
+from jaxskills import checkpoint, families, paths, trainer
+from jaxskills import judge as judge_lib
 from jaxskills.compilation import jit
 from jaxskills.errors import UserError
 from jaxskills.explore import family
@@ -28,17 +29,6 @@ from jaxskills.trainer import TrainConfig, Trainer, TrainState
 
 SAVE_SECONDS = 120.0  # between checkpoints
 _LOG_UPDATES = 5  # between lines of metrics.jsonl
-# Evaluations' share of the time, at most. The fine one runs only near the end and costs four times
-# as much: at the same share it would put off the next one, and so the end, by minutes. While most
-# episodes still fall the end is far, and evaluations are few, unless survival has doubled since.
-_EARLY_SHARE = 0.05
-_EVALUATION_SHARE = 0.2
-_FINE_SHARE = 0.5
-# Of 64 episodes, to stop. A skill is to stand 20 s (SB Table 1) in 95 %, but who stops at that rate
-# stops by luck: in 64 other episodes it comes out lower.
-_SURE_RATE = 0.98
-_PROMISING_SECONDS = 2.0  # of survival while exploring, before an evaluation is worth its time
-
 Report = Callable[[Mapping[str, Any]], None]
 
 
@@ -101,7 +91,7 @@ def _loop(
     stopped: Callable[[], bool],
 ) -> tuple[TrainState, dict[str, Any]]:
     config = made.config
-    judge = _Judge(made)
+    judge = judge_lib.make(made)
     before = history[-1]["wall_s"] if history else 0.0
     saved, fine = time.monotonic(), bool(state.refinement.fine)
     samples, sums, why = int(state.samples), [], ""
@@ -126,10 +116,8 @@ def _loop(
             if sums and (len(sums) == many or why or first):
                 last = line(made, sums, samples, before + time.monotonic() - begin)
                 sums = []
-                if (
-                    not first and made.world is None
-                ):  # few episodes have ended yet, so their mean says nothing
-                    last |= judge(state, last["survival_s"])
+                if not first:  # few episodes have ended yet, so their mean says nothing
+                    last |= judge(state, last)
                 if judge.learnt:
                     why = "learnt"
                 lines.write(json.dumps(last) + "\n")
@@ -140,50 +128,6 @@ def _loop(
                 checkpoint.save(run, state, samples)
                 saved = time.monotonic()
     return state, last | {"why": why}
-
-
-class _Judge:
-    """Evaluates now and then, and says when the skill is learnt.
-
-    A skill counts as learnt when it passes as it was trained and then, with other starts, on a
-    finer engine: a controller that lives off the errors of large time steps does not pass.
-    """
-
-    def __init__(self, made: Trainer):
-        self.learnt = False
-        self._made = made
-        self._compiled: dict[int | None, Any] = {}  # by substeps
-        self._seed = 0
-        self._due = 0.0
-        self._tried = 0.0  # survival at the last evaluation
-
-    def __call__(self, state: TrainState, survival: float) -> dict[str, float]:
-        enabled = self._made.config.stop_when_learnt
-        early = time.monotonic() < self._due and survival < 2.0 * self._tried
-        if early or survival < _PROMISING_SECONDS or not enabled:
-            return {}
-        self._tried = survival
-        found, spent = self._evaluate(state, None)
-        pause = spent / (_EARLY_SHARE if found["success_rate"] < 0.5 else _EVALUATION_SHARE)
-        if found["success_rate"] >= _SURE_RATE:
-            fine, spent = self._evaluate(state, evaluate.FINE_SUBSTEPS)
-            found["fine_success_rate"] = fine["success_rate"]
-            self.learnt = fine["success_rate"] >= _SURE_RATE
-            pause += spent / _FINE_SHARE
-        self._due = time.monotonic() + pause
-        names = ("success_rate", "fine_success_rate", "seconds_mean", "inside_seconds_mean")
-        return {name: found[name] for name in names if name in found}
-
-    def _evaluate(self, state: TrainState, substeps: int | None) -> tuple[dict[str, float], float]:
-        """Returns the figures and the seconds they took; compiling must not put off the next."""
-        self._seed += 1
-        key = jax.random.key(self._seed)
-        if substeps not in self._compiled:
-            trace = evaluate.make(self._made, evaluate.EvaluateConfig(substeps=substeps))
-            self._compiled[substeps] = jit(trace).lower(state, key).compile()
-        begin = time.monotonic()
-        found = evaluate.summary(self._compiled[substeps](state, key))
-        return found, time.monotonic() - begin
 
 
 def line(

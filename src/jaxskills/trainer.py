@@ -50,7 +50,7 @@ class TrainConfig:
     seed: int = 0
     samples: int = 10_000_000  # at most; training stops before when the skill is learnt
     envs: int = 128
-    stop_when_learnt: bool = True  # 20 s without a fall, at 600 Hz physics too
+    stop_when_learnt: bool = True  # 20 s without a fall, at 600 Hz physics too; see judge.py
     horizon: int = 16  # control steps of each environment in an update
     env: core.EnvConfig = core.EnvConfig()
     bounds: bounds_lib.BoundsConfig = dataclasses.field(default_factory=bounds_lib.BoundsConfig)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Things that stand in the way: boxes to jump over, onto or off, walls, bars (FS section 7.1).
 
-Each is a condition, so a task parameter can change it, or one of the fixed `objects` of a task:
+Each is a condition, so a task parameter can change it, or part of the `scenery` of a task:
 
     TaskSpec(
         (Parameter("height", (0.9, 3.0), condition=obstacles.box((0.5, 0.0), (0.1, 1.2), 0.15)),),
@@ -149,7 +149,7 @@ def _add(
 def _object(spec: mujoco.MjSpec, name: str) -> mujoco.MjsGeom:
     names = [geom.name for geom in spec.worldbody.geoms if geom.name != "floor"]
     if name not in names:
-        raise unknown("object", name, names or ["none, as the task has no objects"])
+        raise unknown("object", name, names or ["none, as the task has no scenery"])
     return spec.geom(name)
 
 

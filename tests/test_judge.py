@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When a training is over."""
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import tiny_family
+
+from jaxskills import evaluate, families, judge, trainer
+from jaxskills.judge import FamilyJudge, SkillJudge
+from jaxskills.trainer import Trainer
+
+_STATE: Any = None  # nothing here looks at it
+
+
+@pytest.fixture(scope="module")
+def family(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    return families.make(tiny_family.config(tmp_path_factory.mktemp("walks")))
+
+
+@pytest.fixture
+def skill(family: Trainer) -> Trainer:
+    config = family.config
+    env = dataclasses.replace(config.env, reward="survival", time_warp=False)
+    return trainer.make(dataclasses.replace(config, task="", env=env))
+
+
+def _survived(seconds: float) -> dict[str, float]:
+    return {"survival_s": seconds}
+
+
+def test_a_skill_that_stands_on_coarse_physics_alone_is_not_learnt(
+    skill: Trainer, monkeypatch: pytest.MonkeyPatch
+):
+    rates = {None: 1.0, evaluate.FINE_SUBSTEPS: 0.969}
+
+    def found(self: Any, state: Any, substeps: int | None) -> tuple[dict[str, float], float]:
+        return {"success_rate": rates[substeps]}, 0.0
+
+    monkeypatch.setattr(SkillJudge, "_evaluate", found)
+    judged, state = judge.make(skill), _STATE
+    assert isinstance(judged, SkillJudge)
+    assert judged(state, _survived(1.0)) == {}  # too early to be worth its time
+    assert judged(state, _survived(5.0)) == {"success_rate": 1.0, "fine_success_rate": 0.969}
+    assert not judged.learnt
+    rates[evaluate.FINE_SUBSTEPS] = 0.984  # 63 of 64
+    judged(state, _survived(5.0))
+    assert judged.learnt
+
+
+def test_evaluations_wait_unless_survival_has_doubled(
+    skill: Trainer, monkeypatch: pytest.MonkeyPatch
+):
+    found = {"success_rate": 0.25}
+    monkeypatch.setattr(SkillJudge, "_evaluate", lambda *_: (found, 60.0))  # a costly minute
+    judged, state = judge.make(skill), _STATE
+    times = (2.5, 2.5, 4.9, 5.0, 5.0, 9.9, 10.0)
+    asked = [bool(judged(state, _survived(survival))) for survival in times]
+    assert asked == [True, False, False, True, False, False, True]
+
+
+def _performs(monkeypatch: pytest.MonkeyPatch, off: float, falls: int) -> list[np.ndarray]:
+    """Has all families meet a height that is `off` too much, and fall `falls` times of 50."""
+    asked = []
+
+    def performances(state: Any, a: np.ndarray) -> SimpleNamespace:
+        asked.append(a)
+        through = np.arange(len(a)) >= falls
+        return SimpleNamespace(through=through, met=a + np.array([off, 0.3]))
+
+    monkeypatch.setattr(judge.perform, "make", lambda made, count: performances)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("off", "falls", "learnt"), [(0.02, 2, True), (0.02, 3, False), (0.06, 0, False)]
+)
+def test_a_family_is_learnt_when_it_does_new_tasks_closely(
+    family: Trainer, monkeypatch: pytest.MonkeyPatch, off: float, falls: int, learnt: bool
+):
+    """Heights are multiples, 0.5 to 1.5; gravity is a condition, which is met whatever happens."""
+    asked = _performs(monkeypatch, off, falls)
+    judged, state = judge.make(family), _STATE
+    assert isinstance(judged, FamilyJudge)
+    assert judged(state, {"explored": 0.98}) == {} and not asked
+    found = judged(state, {"explored": 0.995})
+    assert found["success_rate"] == pytest.approx(1 - falls / 50)
+    expected = np.mean(off / (0.5 + asked[0][falls:, 0]))
+    assert found["error_mean"] == pytest.approx(expected, rel=1e-4)
+    assert judged.learnt is learnt
+
+
+def test_a_family_is_asked_for_other_tasks_each_time(
+    family: Trainer, monkeypatch: pytest.MonkeyPatch
+):
+    asked = _performs(monkeypatch, 0.0, 50)
+    judged, state = judge.make(family), _STATE
+    for _ in range(2):
+        assert judged(state, {"explored": 1.0}) == {"success_rate": 0.0, "error_mean": 1.0}
+    assert not judged.learnt
+    assert not np.allclose(asked[0], asked[1])
+
+
+def test_who_wants_all_samples_is_not_judged(family: Trainer, monkeypatch: pytest.MonkeyPatch):
+    asked = _performs(monkeypatch, 0.0, 0)
+    config = dataclasses.replace(family.config, stop_when_learnt=False)
+    judged = judge.make(family._replace(config=config))
+    assert judged(_STATE, {"explored": 1.0, "survival_s": 20.0}) == {}
+    assert not asked and not judged.learnt
