@@ -22,7 +22,7 @@ PAPER = {  # by recipe
     "pivot_family": Paper("Pivot", 0.12e6, 1.0),
     "punch_family": Paper("Punch", 4.2e6, 0.72),
     "push_family": Paper("Push", 0.7e6, 1.0),
-    "side_kick_family": Paper("SideKick", 1.52e6, 0.81),
+    "sidekick_family": Paper("SideKick", 1.52e6, 0.81),
     "spinkick_family": Paper("SpinKick", 0.93e6, 1.0),
     "swing_family": Paper("Swing", 1.5e6, 1.0),
     "wall_jump_family": Paper("WallJump", 1e6, 1.0),

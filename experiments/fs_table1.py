@@ -10,10 +10,11 @@ goes on. `experiments/tables.py` prints the table beside the paper's.
 
 import argparse
 import math
+import shutil
 import sys
 from pathlib import Path
 
-from reproduce import RESULTS, keep, reproduce
+from reproduce import RESULTS, jaxskills, keep, reproduce
 
 from jaxskills import character, commands, recipes, trainer
 
@@ -59,6 +60,15 @@ def main() -> None:
                 samples = options.episodes * steps(name)
             record = reproduce(name, options.seed, run, ("--samples", str(samples)))
             keep(record, run, RESULTS, name)
+            show(run, name)
+
+
+def show(run: Path, name: str) -> None:
+    """Keeps the film of a family over its task space, and the plot of that (FS fig. 5)."""
+    films = sorted(run.glob("*.mp4"))
+    if films:
+        shutil.copy(films[0], RESULTS / f"{name}.mp4")
+    jaxskills("plot", str(run), "--out", str(RESULTS / f"{name}-space.png"))
 
 
 def steps(name: str) -> int:

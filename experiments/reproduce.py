@@ -34,6 +34,7 @@ _FAMILY_COLUMNS = (
         "elites",
         "fitness",
         "task_error",
+        "error_mean",
         "success",
         "base_learnt",
         "refining",

@@ -389,14 +389,14 @@ def test_without_limits_servos_have_any_strength(who: Character, walk: Motion):
     """A push by 2 rad, at a hip of 80 N m/rad that is limited to 40 N m."""
     push = np.zeros(5, np.float32)
     push[3] = 2.0
-    largest = []
+    largest, swung = [], []
     for limited in (True, False):
         made = _running(tiny.make_env(who, walk, EnvConfig(torque_limits=limited)))
         state, outcome = made.step(made.start(jnp.float32(3.0)), push)
         largest.append(np.abs(np.asarray(outcome.report.torque)).max())
-        swung = float(state.sim.qpos[tiny.LEFT_HIP])
+        swung.append(float(state.sim.qpos[tiny.LEFT_HIP]))
     assert largest[0] <= 40.0 * (1 + 1e-4)
-    assert largest[1] > 60.0 and swung > 0.5
+    assert swung[1] > 1.5 * swung[0] > 0.0
     servos = servo.of(who)
     assert (servo.unlimited(servos).torque == jnp.inf).all()
     assert servo.unlimited(servos).kp is servos.kp

@@ -3,11 +3,13 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
 
+from jaxskills import ground, kinematics
 from jaxskills.character import Character
 from jaxskills.env import measure, task
 from jaxskills.env.task import Parameter, TaskSpec
@@ -70,9 +72,11 @@ def test_whole_episodes_are_found_with_what_they_did(who: Character):
     )
     variant = jnp.arange(ENVS) % 2
     most = episodes.room(STEPS, ENVS, 15)
-    found = episodes.finished(
-        who.layout, motions, asks, judge, record, jnp.array([[0.5], [0.6]]), variant, 4, 50, most
-    )
+    asked = jnp.array([[0.5], [0.6]])
+    own = kinematics.body_params(who.model), ground.shapes(who.model)
+    own = jax.tree.map(lambda x: jnp.stack([x, x]), own)
+    of = who.layout, motions, own, asks, judge, record
+    found = episodes.finished(*of, asked, variant, 4, 50, most)
     valid = np.asarray(found.episodes.valid)
     assert valid.sum() == len(whole) and 0 < len(whole) < most
     own = float(asks.reference[0])

@@ -80,6 +80,7 @@ def _run(update, state: TrainState, updates: int) -> TrainState:
     return state
 
 
+@pytest.mark.timeout(300)
 def test_saved_and_restored_families_go_on_bit_for_bit(
     made: Trainer, update, begin: TrainState, traces: list[int], tmp_path: Path
 ):

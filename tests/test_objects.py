@@ -337,7 +337,7 @@ def test_an_object_that_is_not_there(both: tuple[Character, Motion]):
 
 def test_a_trainer_keeps_its_objects(tmp_path: Path):
     """Also with finer physics, and where it is evaluated."""
-    made = trainer.make(tiny.train_config(tmp_path, horizon=2), [BALL])
+    made = trainer.make(tiny.train_config(tmp_path, horizon=2), things=[BALL])
     for one in (made, trainer.refined(made)):
         assert [thing.name for thing in one.character.objects] == ["ball"]
         assert "ball_z" in one.env.endings and one.motion.qpos.shape[1] == 16

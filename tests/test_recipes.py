@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxskills import character, clip, commands, recipes, retarget, trainer
+from jaxskills import character, clip, commands, families, recipes, retarget, trainer
 from jaxskills.errors import UserError
 from jaxskills.recipes import Recipe
 
@@ -86,6 +86,19 @@ def test_the_task_of_a_family_by_name_and_by_file(tmp_path: Path):
     assert recipes.task(str(file)).parameters == ()
     with pytest.raises(UserError, match="task is walk: that recipe has no task"):
         recipes.task("walk")
+
+
+def test_the_recipe_of_the_readme_is_a_family(tmp_path: Path, deepmimic: Path):
+    readme = Path(__file__).parents[1] / "README.md"
+    text = readme.read_text().split("```python\n")
+    (code,) = [part.split("```")[0] for part in text if "TaskSpec" in part]
+    file = tmp_path / "hurdle.py"
+    file.write_text(code)
+    config = commands.settings(recipes.find(str(file)))
+    spec = recipes.task(config.task)
+    own = families.parts(config, spec)
+    np.testing.assert_allclose(own.task.reference, [1.0], atol=0.15)  # m, the jump of the clip
+    np.testing.assert_allclose(own.task.base, [0.2, 0.5], atol=1e-6)
 
 
 @pytest.mark.parametrize(
