@@ -67,6 +67,15 @@ def test_alternating_by_rate():
     assert _phases(QUICK, [rates for rates, _ in script]) == expected
 
 
+def test_phases_take_turns_while_nothing_is_found():
+    """With a memory of 0.5 the rates of the first update, 1 and 0, are below 0.1 from the fifth on."""
+    config = dataclasses.replace(QUICK, memory=0.5, idle=0.1, idle_duration=3)
+    nothing = [(0, 0)] * 12
+    assert _phases(config, [(1, 0), *nothing]) == "EEEE" + "RRR" + "EEE" + "RRR"
+    assert _phases(config, [(1, 0), *nothing[:6], (1, 0), *nothing[:3]]) == "EEEERRRREEE"
+    assert _phases(dataclasses.replace(config, idle=0.0), [(1, 0), *nothing]) == "E" * 13
+
+
 def test_rates_are_running_means_per_task_parameter():
     """The first count alike, later ones a fifth; a region without samples keeps its rate."""
     config = dataclasses.replace(QUICK, memory=0.8)
@@ -301,6 +310,8 @@ def test_a_region_grows_from_the_reference_to_the_whole_space():
         ({"renew": 0}, "curriculum.renew is 0: give 1 or more"),
         ({"probes": 0}, "curriculum.probes is 0: give 1 to 19"),
         ({"probes": 20}, "curriculum.probes is 20: give 1 to 19"),
+        ({"idle": -0.1}, "curriculum.idle is -0.1: give a rate of 0 or more"),
+        ({"idle_duration": 0}, "curriculum.idle_duration is 0: give 1 or more"),
         ({"memory": 1.0}, "curriculum.memory is 1.0: give 0 <= memory < 1"),
         ({"patience": 0}, "curriculum.patience is 0: give 1 or more"),
         ({"full": 0.0}, "curriculum.full is 0.0: give 0 < full <= 1"),

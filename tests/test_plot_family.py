@@ -108,7 +108,7 @@ def test_explored_over_episodes(axes: Axes):
     plot_family.ratio(METRICS, axes)
     np.testing.assert_allclose(axes.lines[0].get_xdata(), [0.6, 1.2, 1.8, 2.4])
     np.testing.assert_allclose(axes.lines[0].get_ydata(), [10, 20, 30, 40])
-    assert axes.get_title(loc="left") == "40% explored after 2400 episodes"
+    assert axes.get_title(loc="left") == "40% explored"
 
 
 def test_quality_of_the_episodes(axes: Axes):

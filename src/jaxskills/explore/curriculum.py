@@ -8,6 +8,10 @@ The rates that FS 6.3 compares are counts of few elites, so phases would flicker
 them: the rates are running means, and several updates in a row must speak for the change. At the
 default numbers a single batch changes the phase only if it is off by 8 times as much as the rates
 lie apart: 0.2 of it stays after the first update, 0.8^2 of that at the third.
+
+FS does not say what happens when neither region gives anything, which is not the end: a policy that
+explores one side of its region unlearns the other, and then does not even get to its own elites.
+Then phases of a fixed length take turns, until something is found again.
 """
 
 import dataclasses
@@ -45,6 +49,8 @@ class CurriculumConfig:
     probes: int = 2  # of a batch come from the region that it is not the phase of
     memory: float = 0.8  # of the running mean of an exploration rate, with each update
     patience: int = 3  # updates in a row must speak for a change of phase; of mastering too
+    idle: float = 0.01  # with both rates below that, nothing is found,
+    idle_duration: int = 8  # and phases have so many updates
     # explore_only
     full: float = 0.99  # share of the task space that is everything
     # mastering
@@ -192,7 +198,9 @@ def _opinion(
         case "alternating_by_rate":
             less = complete | (state.rate[0] < state.rate[1])
             more = ~complete & (state.rate[0] > state.rate[1])
-            return jnp.where(exploring, less, more) & (state.seen > 0).all(), no
+            known, idle = (state.seen > 0).all(), (state.rate < config.idle).all() & ~complete
+            decided = jnp.where(exploring, less, more) & known & ~idle
+            return decided, idle & known & (age >= config.idle_duration)
         case "mastering":
             mastered = state.value >= config.mastery
             return jnp.where(exploring, ~mastered, mastered), age >= config.timeout
@@ -213,7 +221,7 @@ def validate(config: CurriculumConfig) -> None:
     if config.method not in get_args(Method):
         raise unknown("curriculum method", config.method, get_args(Method))
     sampling.validate(config.sampling)
-    for name in ("batch", "renew", "patience", "timeout", "duration"):
+    for name in ("batch", "renew", "patience", "idle_duration", "timeout", "duration"):
         if getattr(config, name) < 1:
             raise UserError(f"curriculum.{name} is {getattr(config, name)}: give 1 or more")
     if config.batch > config.sampling.pool:
@@ -222,6 +230,8 @@ def validate(config: CurriculumConfig) -> None:
         )
     if not 1 <= config.probes < config.batch and config.method == "alternating_by_rate":
         raise UserError(f"curriculum.probes is {config.probes}: give 1 to {config.batch - 1}")
+    if not 0 <= config.idle < math.inf:
+        raise UserError(f"curriculum.idle is {config.idle}: give a rate of 0 or more")
     if not 0 <= config.memory < 1:
         raise UserError(f"curriculum.memory is {config.memory}: give 0 <= memory < 1")
     if not 0 < config.full <= 1:

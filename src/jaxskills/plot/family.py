@@ -196,7 +196,7 @@ def ratio(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
     axes.plot(episodes / 1e3, 100.0 * shares, color=BLUE, marker="o" if len(shares) == 1 else "")
     axes.set_ylim(0, 103)
     axes.set_xlim(left=0.0)
-    title = f"{shares[-1]:.0%} explored after {episodes[-1]:.0f} episodes"
+    title = f"{shares[-1]:.0%} explored"
     finish(axes, title, "episodes (thousands)", "explored (%)")
 
 
@@ -211,9 +211,9 @@ def quality(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
     ):
         axes.plot(updates, _column(metrics, key), color=colour, lw=1.2, label=label, marker=mark)
     axes.set_xlim(0.5, len(metrics) + 0.5)
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, 1.7)  # room for the legend
     finish(axes, "Training episodes", "updates", "")
-    axes.legend(fontsize=8, frameon=False)
+    axes.legend(fontsize=8, frameon=False, loc="upper left")
 
 
 def met(asked: Asked, i: int, axes: Axes) -> None:
