@@ -68,7 +68,7 @@ def test_alternating_by_rate():
 
 
 def test_phases_take_turns_while_nothing_is_found():
-    """With a memory of 0.5 the rates of the first update, 1 and 0, are below 0.1 from the fifth on."""
+    """With a memory of 0.5 the rates of the first update are below 0.1 from the fifth on."""
     config = dataclasses.replace(QUICK, memory=0.5, idle=0.1, idle_duration=3)
     nothing = [(0, 0)] * 12
     assert _phases(config, [(1, 0), *nothing]) == "EEEE" + "RRR" + "EEE" + "RRR"
