@@ -59,7 +59,8 @@ def draw(
     body = max(take.body for take in takes)
     aside += _ASIDE * body
     low -= _BELOW * body
-    high += 2 * aside * _TEXT * (0.5 + _LEADING * (2 if any(row.name for row in rows) else 1))
+    lines = 1 + max(len(_lines(row.name)) for row in rows)
+    high += 2 * aside * _TEXT * (0.5 + _LEADING * lines)
     lens = dataclasses.replace(lens, distance=(high - low) / 2 / np.tan(np.radians(_FOVY / 2)))
     wide = max((width - (count - 1) * _GAP) // count, 1)
     tall = round(wide * (high - low) / (2 * aside))
@@ -115,4 +116,10 @@ def _write(panel: Image.Image, label: str, name: str) -> None:
     pen = ImageDraw.Draw(panel)
     pen.text((margin, margin), label, INK, font)
     colour = GREEN if name in ("reference", _GREEN) else INK
-    pen.text((margin, margin + _LEADING * size), name, colour, font)
+    for i, line in enumerate(_lines(name)):
+        pen.text((margin, margin + (1 + i) * _LEADING * size), line, colour, font)
+
+
+def _lines(name: str) -> list[str]:
+    """Returns what a row is called, by lines: a panel is too narrow for several parameters."""
+    return name.split(", ") if name else []
