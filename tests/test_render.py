@@ -253,6 +253,15 @@ def test_left_and_right_differ_unless_the_author_saw_to_it(gl, walker, tmp_path)
     assert left.sum() > right.sum() + 100
 
 
+@pytest.mark.parametrize("distance", [3.0, 20.0, 100.0])
+def test_all_around_is_floor_or_air(gl, walker, distance):
+    lens = stage.Lens(azimuth=180.0, elevation=-8.0, distance=distance, fovy=15.0)
+    with stage.opened(walker.model, FORWARD, lens, 60, 100) as studio:
+        for height in (0.0, 5.0, 20.0):
+            found = stage.picture(studio, np.array([0.0, 0.0, height]), None)
+            assert found.min() > 150
+
+
 def test_only_the_character_has_a_ghost(gl, walker, tmp_path):
     box = '<geom type="box" size="0.2 0.2 0.2" pos="0 0.7 0.2" rgba="1 0 0 1"/>'
     with_box = _walker(tmp_path, extra=box)

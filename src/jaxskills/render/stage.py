@@ -93,8 +93,9 @@ def opened(
     look.quality.numslices, look.quality.numstacks, look.quality.numquads = 16, 8, 1
     look.quality.shadowsize, look.quality.offsamples = 2048, 4
     solid.stat.extent = 1.0  # so that the following are metres
-    look.map.znear, look.map.zfar = 0.05 * lens.distance, lens.distance + 9 * body
-    look.map.fogstart, look.map.fogend = lens.distance + body, lens.distance + 4 * body
+    far = _far(lens, body)
+    look.map.znear, look.map.zfar = 0.05 * lens.distance, 2.0 * far  # behind all of the backdrop
+    look.map.fogstart, look.map.fogend = lens.distance + body, far
     look.map.shadowclip = 1.6 * body
     look.rgba.fog[:] = _AIR
     floor = float(min(model.geom_pos[_floors(model), 2], default=0.0))
@@ -234,7 +235,7 @@ def _add_figure(scene: mujoco.MjvScene, data: mujoco.MjData, qpos: np.ndarray) -
 def _add_ground(stage: Stage, lookat: np.ndarray) -> None:
     """Adds the tiles that the camera sees, as far as the fog lets it, and the backdrop behind."""
     lens, level = stage.lens, np.eye(3)
-    far = lens.distance + 4 * stage.body
+    far = _far(lens, stage.body)
     eye = np.append(lookat[:2], 0.0) - lens.distance * lens.forward
     size = 0.5 * 2.0 ** round(np.log2(stage.body / 1.6))  # half a metre for a human
     count = int(far / size) + 2
@@ -249,6 +250,11 @@ def _add_ground(stage: Stage, lookat: np.ndarray) -> None:
     # Beyond the end of the fog, so that it has the colour of the air whatever the light.
     upright = np.stack([-lens.right, UP, -lens.forward], 1)
     _add_plane(stage.scene, eye + 1.3 * far * lens.forward, upright, 3 * far, _AIR)
+
+
+def _far(lens: Lens, body: float) -> float:
+    """Returns how far away (m) there is nothing but air."""
+    return lens.distance + 4 * body
 
 
 def _add_plane(
