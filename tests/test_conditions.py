@@ -20,7 +20,7 @@ def who() -> Character:
 
 
 def changed(who: Character, condition: Condition, factor: float) -> mujoco.MjModel:
-    return character.compile(who, 1 / 120, edit=lambda spec: condition(spec, who, factor))
+    return character.placed(who, [lambda spec: condition(spec, who, factor)], 1 / 120).model
 
 
 @pytest.mark.parametrize("condition", [conditions.length(LEG), conditions.width(LEG)])

@@ -36,7 +36,7 @@ explore.episodes explore
 trainer recipes families checkpoint runs evaluate perform evaluate_family controller
 style_measures judge train
 render.opengl render.stage render.take render.video render.several render.strip render
-plot.sheet plot.states plot.training plot.starts plot.family plot
+plot.sheet plot.lines plot.states plot.training plot.starts plot.family plot
 task_values playback playback_family provenance
 
 progress arguments commands cli __main__

@@ -52,7 +52,7 @@ def _weightless(spec: mujoco.MjSpec) -> None:
 
 def _before_the_box(pusher: Character, apart: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """Returns the walker adrift, its torso that far before the face."""
-    model = character_lib.compile(pusher, STEP, edit=_weightless)
+    model = character_lib.placed(pusher, [_weightless], STEP).model
     data = mujoco.MjData(model)
     data.qpos[:3] = FACE - TORSO - apart, 0.0, 0.7
     return model, data
@@ -140,7 +140,8 @@ def test_when_hands_stick(pusher: Character, share: float, sticks: float):
 
 def _heavy(pusher: Character, factor: float) -> mujoco.MjModel:
     change = push.mass(BOX)
-    return character_lib.compile(pusher, STEP, edit=lambda spec: change(spec, pusher, factor))
+    changes = [lambda spec: change(spec, pusher, factor)]
+    return character_lib.placed(pusher, changes, STEP).model
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 10.0])
@@ -239,5 +240,5 @@ def test_a_hand_that_is_none(who: Character, leap: Motion):
 
 def test_the_mass_of_no_box(who: Character):
     with pytest.raises(UserError) as raised:
-        character_lib.compile(who, STEP, edit=lambda spec: push.mass(BOX)(spec, who, 2.0))
+        character_lib.placed(who, [lambda spec: push.mass(BOX)(spec, who, 2.0)], STEP)
     assert str(raised.value).startswith("unknown object beside walker 'box'")

@@ -122,7 +122,7 @@ def test_a_hit_keeps_momentum_and_comes_in_time(both, before):
     def weightless(spec: mujoco.MjSpec) -> None:
         spec.option.gravity = [0.0, 0.0, 0.0]
 
-    model = character_lib.compile(whole, STEP, edit=weightless)
+    model = character_lib.placed(whole, [weightless], STEP).model
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = _gliding(whole, (SPEED, 0.0, 0.0))
     data.qpos[:], data.qvel[:] = before(data.qpos, data.qvel, 14.25)

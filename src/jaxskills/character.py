@@ -177,11 +177,10 @@ def compile(  # noqa: A001
     character: Character,
     timestep: float,
     integrator: str = "discrete",
-    edit: Callable[[mujoco.MjSpec], None] | None = None,
 ) -> mujoco.MjModel:
     """Returns the model with one position servo per actuated degree of freedom.
 
-    The actuators of objects come first, then those of its scenery and of `edit`.
+    The actuators of objects come first, then those of its scenery, then the servos.
 
     `discrete` is implicit in positions and velocities and solves contacts with the same implicit
     mass. `implicitfast`, for engines without it, gets kv = kd + h kp, which has the right hand side
@@ -193,7 +192,6 @@ def compile(  # noqa: A001
       character: what to compile.
       timestep: h in s.
       integrator: one of `INTEGRATORS`.
-      edit: changes the spec, objects and scenery included, before servos are added: for a variant.
 
     Raises:
       UserError: unknown integrator.
@@ -203,7 +201,7 @@ def compile(  # noqa: A001
     spec = _bare_spec(Path(character.source))
     for thing in character.objects:
         thing.build(spec)
-    for change in (*character.scenery, *(() if edit is None else (edit,))):
+    for change in character.scenery:
         change(spec)
     spec.option.timestep = timestep
     spec.option.integrator = INTEGRATORS[integrator]

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxskills.errors import UserError
+from jaxskills.plot.lines import check, column
 from jaxskills.plot.sheet import BLUE, GREEN, GREY, ORANGE, RED, admitted, finish, say
 from jaxskills.plot.training import causes
 
@@ -67,7 +67,7 @@ def figure(
       UserError: another suffix, or metrics without lines or without what each line must have.
     """
     path = admitted(path)
-    _check(metrics)
+    check(metrics, _REQUIRED)
     shown = () if asked is None else asked.names[:_PANELS]
     single = len(explored.maps) == 1  # then density and fitness stand side by side
     rows = 4 - single + bool(shown)
@@ -102,7 +102,7 @@ def curriculum(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
     Raises:
       UserError: no lines, or a line without what a family's lines have.
     """
-    _check(metrics)
+    check(metrics, _REQUIRED)
     updates = np.arange(1, len(metrics) + 1)
     phases = [_phase(line) for line in metrics]
     begin = 0
@@ -120,7 +120,7 @@ def curriculum(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
         ("rate_inside", ORANGE, "and inside of it", axes),
         ("marginal", BLUE, "mean marginal value", right),
     ):
-        values = np.where(known, _column(metrics, key), np.nan)
+        values = np.where(known, column(metrics, key), np.nan)
         on.plot(updates, values, color=colour, lw=1.4, label=label, marker=mark, ms=3)
     axes.set_xlim(0.5, len(metrics) + 0.5)
     axes.set_ylim(bottom=0.0)
@@ -192,7 +192,7 @@ def fitness(explored: Explored, place: tuple[int, ...], axes: Axes) -> None:
 
 def ratio(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
     """Draws the explored share of the task space over episodes (FS fig. 8)."""
-    episodes, shares = _column(metrics, "episodes"), _column(metrics, "explored")
+    episodes, shares = column(metrics, "episodes"), column(metrics, "explored")
     axes.plot(episodes / 1e3, 100.0 * shares, color=BLUE, marker="o" if len(shares) == 1 else "")
     axes.set_ylim(0, 103)
     axes.set_xlim(left=0.0)
@@ -209,7 +209,7 @@ def quality(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
         ("fitness", GREEN, "fitness"),
         ("task_error", RED, "error of the task, of its range"),
     ):
-        axes.plot(updates, _column(metrics, key), color=colour, lw=1.2, label=label, marker=mark)
+        axes.plot(updates, column(metrics, key), color=colour, lw=1.2, label=label, marker=mark)
     axes.set_xlim(0.5, len(metrics) + 0.5)
     axes.set_ylim(0.0, 1.7)  # room for the legend
     finish(axes, "Training episodes", "updates", "")
@@ -241,16 +241,3 @@ def _phase(line: Mapping[str, Any]) -> str:
     if not line.get("base_learnt", True):
         return "the reference alone"
     return "refinement" if line["refining"] else "exploration"
-
-
-def _check(metrics: Sequence[Mapping[str, Any]]) -> None:
-    if not metrics:
-        raise UserError("there is nothing to plot: metrics.jsonl has no lines yet")
-    for number, line in enumerate(metrics, 1):
-        missing = [key for key in _REQUIRED if key not in line]
-        if missing:
-            raise UserError(f"line {number} of metrics.jsonl lacks {', '.join(missing)}")
-
-
-def _column(metrics: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
-    return np.array([line.get(key, np.nan) for line in metrics], float)

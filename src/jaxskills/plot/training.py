@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxskills.errors import UserError
 from jaxskills.plot import states
+from jaxskills.plot.lines import check, column
 from jaxskills.plot.sheet import (
     BLUE,
     CYCLE,
@@ -33,22 +33,22 @@ def learning_curve(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
     Raises:
       UserError: no lines, or a line without `samples`, `wall_s` or `survival_s`.
     """
-    _check(metrics)
+    check(metrics, _REQUIRED)
     samples = _millions(metrics)
-    survival = _column(metrics, "survival_s")
+    survival = column(metrics, "survival_s")
     mark = "" if len(survival) > 1 else "o"
     axes.plot(samples, survival, color=BLUE, marker=mark, label="training, until a bound")
     for key, colour, label in (
         ("inside_seconds_mean", GREEN, "test, until a bound"),
         ("seconds_mean", ORANGE, "test, until a fall"),
     ):
-        values = _column(metrics, key)
+        values = column(metrics, key)
         seen = np.isfinite(values)
         if seen.any():
             axes.plot(samples[seen], values[seen], "o-", color=colour, ms=3, lw=1, label=label)
     axes.set_xlim(left=0.0)
     axes.set_ylim(0.0, min(axes.get_ylim()[1], _LONGEST))
-    scale = _column(metrics, "bound_scale")
+    scale = column(metrics, "bound_scale")
     if np.isfinite(scale).any():
         right = axes.twinx()
         right.plot(samples, scale, color=RED, lw=1)
@@ -68,9 +68,9 @@ def causes(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
     Raises:
       UserError: see `learning_curve`.
     """
-    _check(metrics)
+    check(metrics, _REQUIRED)
     names = sorted({key for line in metrics for key in line if key.startswith("ended/")})
-    all_causes = {n.removeprefix("ended/"): np.nan_to_num(_column(metrics, n)) for n in names}
+    all_causes = {n.removeprefix("ended/"): np.nan_to_num(column(metrics, n)) for n in names}
     shown = foremost(all_causes, len(CYCLE))
     finish(axes, "What ended training episodes", "samples (millions)", "share (%)")
     axes.set_ylim(0, 100)
@@ -91,7 +91,7 @@ def training_endings(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
     Raises:
       UserError: see `learning_curve`.
     """
-    _check(metrics)
+    check(metrics, _REQUIRED)
     recorded = [line["endings"] for line in metrics if "endings" in line]
     if not recorded:
         finish(axes, "Where training episodes ended", PHASE, "")
@@ -104,22 +104,8 @@ def training_endings(metrics: Sequence[Mapping[str, Any]], axes: Axes) -> None:
     states.endings(total, axes, told="Where {} training episodes ended")
 
 
-def _check(metrics: Sequence[Mapping[str, Any]]) -> None:
-    if not metrics:
-        raise UserError("there is nothing to plot: metrics.jsonl has no lines yet")
-    for number, line in enumerate(metrics, 1):
-        missing = [key for key in _REQUIRED if key not in line]
-        if missing:
-            raise UserError(f"line {number} of metrics.jsonl lacks {', '.join(missing)}")
-
-
-def _column(metrics: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
-    """Returns an entry of every line, NaN where a line lacks it."""
-    return np.array([line.get(key, np.nan) for line in metrics], float)
-
-
 def _millions(metrics: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    return _column(metrics, "samples") / 1e6
+    return column(metrics, "samples") / 1e6
 
 
 def _duration(line: Mapping[str, Any]) -> str:
