@@ -143,6 +143,9 @@ COMPARISONS: dict[str, dict[str, Case]] = {
     "dodge_curricula": _curricula("dodge_family", 4_000_000),
     "jump_curricula": _curricula("jump_gravity_family", 10_000_000),
     "dodge_stop": _switched("dodge_family", 4_000_000, "bounds", "fall", "--env.stop fall"),
+    "push_torque": _switched(
+        "push_family", 4_000_000, "limited", "unlimited", "--env.no-torque-limits"
+    ),
 }
 
 

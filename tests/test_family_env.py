@@ -109,7 +109,8 @@ def test_the_task_is_paid_when_it_is_known(who: Character, family: Environment):
             paid.append((float(state.phase), float(outcome.spike)))
         spikes = [(phase, spike) for phase, spike in paid if spike]
         assert len(spikes) == 1 and 15.0 <= spikes[0][0] < 16.3
-        expected = 10.0 * np.exp(-(((factor - wanted) / 0.2) ** 2))
+        off = ((factor - wanted) / 0.2) ** 2
+        expected = 5.0 * np.exp(-off) + 5.0 * np.exp(-off / 9)
         assert spikes[0][1] == pytest.approx(expected, rel=0.02)
 
 

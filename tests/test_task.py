@@ -72,16 +72,22 @@ def test_the_spike_comes_once_when_everything_is_known(who: Character, made: tas
     _, rows = _play(who, made, [0.9, 0.25], height)
     assert np.flatnonzero(rows[:, 1]).tolist() == [23] and not rows[:, 0].any()  # at 24/30 = 0.8
     assert rows[23, 1] == pytest.approx(10.0, rel=1e-3)
-    # Asked for 1.2 times the height but 1.0 of it reached: exp(-(0.2 / 0.2)^2).
+    # Asked for 1.2 times the height but 1.0 of it reached: one sigma of 0.2, a third of the other.
     _, rows = _play(who, made, [0.9, 0.5], height)
+    assert rows[23, 1] == pytest.approx(5.0 * np.exp(-1.0) + 5.0 * np.exp(-1 / 9), rel=1e-3)
+
+
+def test_without_reach_the_spike_is_that_of_the_paper(who: Character, walk: Motion):
+    made = task.make(dataclasses.replace(SPEC, reach=1.0), who, walk)
+    _, rows = _play(who, made, [0.9, 0.5], float(made.reference[0]))
     assert rows[23, 1] == pytest.approx(10.0 * np.exp(-1.0), rel=1e-3)
 
 
 def test_a_constraint_is_asked_for_too(who: Character, made: task.Task):
-    """A performance of 60 steps takes twice as long: exp(-(1 / 0.2)^2)."""
+    """A performance of 60 steps takes twice as long, 5 sigmas off."""
     height = float(made.reference[0])
     known, rows = _play(who, made, [0.9, 0.25], height, steps=60)
-    assert rows[:, 1].sum() == pytest.approx(10.0 * np.exp(-25.0), rel=1e-2)
+    assert rows[:, 1].sum() == pytest.approx(5.0 * np.exp(-25.0 / 9), rel=1e-2)
     assert float(made.hindsight(known, jnp.array([0.9, 0.25]))[1]) == pytest.approx(np.exp(-25.0))
 
 
@@ -194,6 +200,11 @@ def test_wrong_values_are_refused(values: dict[str, float], message: str):
 def test_broken_specifications_are_refused(parameters: tuple[Parameter, ...], message: str):
     with pytest.raises(UserError, match=message):
         task.validate(TaskSpec(parameters))
+
+
+def test_half_of_the_reward_is_not_narrower_than_the_other():
+    with pytest.raises(UserError, match="reach 0.5: give 1 or more"):
+        task.validate(TaskSpec((HEIGHT,), reach=0.5))
 
 
 def test_what_the_reference_has_nothing_of_has_no_multiples(who: Character, walk: Motion):

@@ -5,7 +5,7 @@ from jaxskills.env import measure
 from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import TrainConfig, for_family
 
 # Off the ground, as shares of the clip.
 _AIR = 0.42, 0.66
@@ -33,7 +33,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=TrainConfig(
-        envs=160, env=EnvConfig(reward="tracking", time_warp=True, heading="lateral")
-    ),
+    config=for_family(TrainConfig(env=EnvConfig(heading="lateral"))),
 )

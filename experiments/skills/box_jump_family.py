@@ -9,10 +9,9 @@ the box has jumped another distance on level ground.
 """
 
 from jaxskills.env import measure, obstacles
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 _FAR = 1.07  # m that the clip jumps
 _BEGIN, _END = 0.01, 1.0  # shares of the clip, in the same pose
@@ -41,5 +40,5 @@ RECIPE = Recipe(
         ),
         scenery=(_FIRST, _SECOND),
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

@@ -5,7 +5,7 @@ from jaxskills.env import conditions, measure
 from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import TrainConfig, for_family
 
 _ARMS = "right_shoulder", "right_elbow", "left_shoulder", "left_elbow"
 _LEGS = "right_hip", "right_knee", "left_hip", "left_knee"
@@ -30,7 +30,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=TrainConfig(
-        envs=160, env=EnvConfig(reward="tracking", time_warp=True, may_touch=_TOUCH)
-    ),
+    config=for_family(TrainConfig(env=EnvConfig(may_touch=_TOUCH))),
 )

@@ -2,10 +2,9 @@
 """FS Table 1, Dodge: the side to which one ducks."""
 
 from jaxskills.env import measure
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 # Where the neck is before, and the way it goes from there (rad from forward to the left).
 _GUARD, _LEFT = (0.04, -0.01), 1.2
@@ -24,5 +23,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

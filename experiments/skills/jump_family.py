@@ -2,10 +2,9 @@
 """FS Table 1, Jump: energy at take-off, and gravity."""
 
 from jaxskills.env import conditions, measure
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 RECIPE = Recipe(
     name="jump_family",
@@ -24,5 +23,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

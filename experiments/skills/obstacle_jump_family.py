@@ -7,10 +7,9 @@ reference: a jump that ends in front of the hurdle, or on it, does not count.
 """
 
 from jaxskills.env import measure, obstacles
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 RECIPE = Recipe(
     name="obstacle_jump_family",
@@ -31,5 +30,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

@@ -2,10 +2,9 @@
 """FS Table 1, Pivot: how far one turns."""
 
 from jaxskills.env import measure
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 RECIPE = Recipe(
     name="pivot_family",
@@ -20,5 +19,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

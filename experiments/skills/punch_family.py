@@ -2,10 +2,9 @@
 """FS Table 1, Punch: where to and how hard."""
 
 from jaxskills.env import measure, strike
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 FIST = strike.Target("right_wrist", share=0.375)
 # Where the clip begins, and the way its punch goes from there (rad from forward to the left).
@@ -35,5 +34,5 @@ RECIPE = Recipe(
         ),
         objects=(strike.target(FIST),),
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

@@ -2,10 +2,9 @@
 """FS Table 1, Push: how heavy the box is."""
 
 from jaxskills.env import measure, push
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 # With friction 0.3, as in the clip, 180 kg need 530 N: more than the feet of 45 kg hold, 400 N.
 BOX = push.Box(("right_wrist", "left_wrist"), begin=0.15, end=0.81, face=0.65, friction=0.15)
@@ -22,5 +21,5 @@ RECIPE = Recipe(
         ),
         objects=(push.box(BOX),),
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

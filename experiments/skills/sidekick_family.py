@@ -2,10 +2,9 @@
 """FS Table 1, SideKick: where to, how hard and how high."""
 
 from jaxskills.env import measure, strike
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 FOOT = strike.Target("right_ankle", share=0.42)
 # Where the clip begins, and the way its kick goes from there (rad from forward to the left).
@@ -30,5 +29,5 @@ RECIPE = Recipe(
         ),
         objects=(strike.target(FOOT),),
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

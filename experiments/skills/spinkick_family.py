@@ -2,10 +2,9 @@
 """FS Table 1, SpinKick: how high the foot goes and how far one turns."""
 
 from jaxskills.env import measure
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 RECIPE = Recipe(
     name="spinkick_family",
@@ -25,5 +24,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

@@ -8,11 +8,10 @@ by 7 cm. Its height is a condition; a performance has to get as far as the refer
 """
 
 from jaxskills.env import measure, obstacles
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.holds import Grip
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import for_family
 
 _GRIP = Grip(("left_wrist", "right_wrist"), begin=0.335, end=0.565)
 
@@ -36,5 +35,5 @@ RECIPE = Recipe(
         ),
         scenery=(obstacles.bar((0.56, 0.0), 2.3, grip=_GRIP),),
     ),
-    config=TrainConfig(envs=160, env=EnvConfig(reward="tracking", time_warp=True)),
+    config=for_family(),
 )

@@ -10,7 +10,9 @@ from jaxskills.env import measure, obstacles
 from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig
+from jaxskills.trainer import TrainConfig, for_family
+
+_TOUCH = "left_ankle", "right_ankle", "left_wrist", "right_wrist"
 
 RECIPE = Recipe(
     name="wall_jump_family",
@@ -31,12 +33,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=TrainConfig(
-        envs=160,
-        env=EnvConfig(
-            reward="tracking",
-            time_warp=True,
-            may_touch=("left_ankle", "right_ankle", "left_wrist", "right_wrist"),
-        ),
-    ),
+    config=for_family(TrainConfig(env=EnvConfig(may_touch=_TOUCH))),
 )

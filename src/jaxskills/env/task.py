@@ -68,6 +68,9 @@ class TaskSpec:
     objects: tuple[Object, ...] = ()  # what moves beside the character, see `objects.add`
     spike_weight: float = 10.0  # w_task of FS section 4.2 for spike rewards
     continuous_weight: float = 0.1  # and for continuous ones
+    # Half of the task reward is so many sigmas wide: eq. 8 alone is flat far from what is asked
+    # for, or gives little for the last bit. 1 is eq. 8 itself.
+    reach: float = 3.0
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -148,11 +151,12 @@ def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
         known = jnp.stack(rows)
         off = ((values(known) - wanted(a)) / sigma) ** 2
         passed = (shares[0] < end) & (end <= shares[1])
-        reward = jnp.exp(-jnp.sum(jnp.where(steady, 0.0, off)))
+        reward = _closeness(jnp.sum(jnp.where(steady, 0.0, off)), spec.reach)
         spike = jnp.where(passed & bool(at_end), spec.spike_weight * reward, 0.0)
         during = jnp.array([m.begin for m in measures]) <= shares[1]
         during &= shares[1] <= jnp.array([m.end for m in measures])
-        tracked = jnp.exp(-(((now / unit - wanted(a)) / sigma) ** 2)) * during * steady
+        apart = ((now / unit - wanted(a)) / sigma) ** 2
+        tracked = _closeness(apart, spec.reach) * during * steady
         rate = spec.continuous_weight * jnp.sum(tracked) / max(int(steady.sum()), 1)
         return known, rate, spike
 
@@ -177,6 +181,11 @@ def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
     weight = 1.0 - spec.continuous_weight if steady.any() else 1.0
     own = jnp.asarray(own, jnp.float32)
     return Task(start, step, observe, hindsight, kept, own, base, begin, end, weight)
+
+
+def _closeness(off: jax.Array, reach: float) -> jax.Array:
+    """Returns 0 to 1, of a squared distance in sigmas (FS eq. 8, and half of it wider)."""
+    return 0.5 * (jnp.exp(-off) + jnp.exp(-off / reach**2))
 
 
 def placed(spec: TaskSpec, character: Character) -> Character:
@@ -295,6 +304,8 @@ def validate(spec: TaskSpec) -> None:
       UserError: a name twice, a range out of order, neither or both of measure and condition.
     """
     names = [p.name for p in spec.parameters]
+    if not 1 <= spec.reach < math.inf:
+        raise UserError(f"task: reach {spec.reach}: give 1 or more")
     for p in spec.parameters:
         if names.count(p.name) > 1:
             raise UserError(f"task parameter {p.name} comes twice: give each its own name")
