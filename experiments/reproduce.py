@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxskills import provenance
+from jaxskills.cli import INTERRUPTED
 from jaxskills.evaluate import FINE_SUBSTEPS
 
 RESULTS = Path(__file__).parent / "results"
@@ -51,11 +52,16 @@ def reproduce(skill: str, seed: int, run: Path, options: tuple[str, ...] = ()) -
       seed: of the training.
       run: folder; resumed if it has a configuration.
       options: of `jaxskills train`, besides.
+
+    Raises:
+      SystemExit: the training was interrupted, so there is nothing to record yet.
     """
     resumed = (run / "config.json").is_file()
     options = ("train", skill, "--seed", str(seed), *options, "--out", str(run))
     print(shlex.join(options), file=sys.stderr)
     code, seconds, first = train([*options, *["--resume"] * resumed])
+    if code == INTERRUPTED:
+        raise SystemExit(code)
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     last = rows[-1]
     record = {

@@ -12,7 +12,14 @@ from jaxskills import physics
 from jaxskills.errors import UserError
 from jaxskills.paths import deepmimic_dirs
 
-# Before jax uses a device: MJX under vmap can wait for ever on two cores otherwise.
+# Tests compile more than they run: two fifths of the time, if LLVM leaves out its optimisations.
+# What they start inherits it. Before jax uses a device, as what follows.
+os.environ["XLA_FLAGS"] = (
+    os.environ.get("XLA_FLAGS", "")
+    + " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+)
+
+# MJX under vmap can wait for ever on two cores otherwise.
 physics.configure_cpu()
 
 

@@ -192,6 +192,13 @@ def test_a_thinned_curve_keeps_its_ends_and_its_evaluations(count: int):
     assert len(kept) <= 2 * 40 + 2
 
 
+def test_an_interrupted_training_is_not_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = script("reproduce")
+    monkeypatch.setattr(made, "train", lambda options: (130, 1.0, None))
+    with pytest.raises(SystemExit, match="130"):
+        made.reproduce("walk", 0, tmp_path)
+
+
 def test_where_a_record_was_made(tmp_path: Path):
     found = provenance.describe(tmp_path)
     assert found["versions"]["jax"] == jax.__version__

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`jit` with what suits the default device."""
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,11 @@ _CPU_OPTIONS: dict[str, Any] = {
 
 
 def jit(function: Callable[..., Any], *, donate: bool = False) -> Any:
-    """Returns the jitted function; with `donate` its first argument's buffers are reused."""
-    options = _CPU_OPTIONS if jax.default_backend() == "cpu" else None
+    """Returns the jitted function; with `donate` its first argument's buffers are reused.
+
+    What the variable XLA_FLAGS names is as it says.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    free = {name: value for name, value in _CPU_OPTIONS.items() if name not in flags}
+    options = free if jax.default_backend() == "cpu" else None
     return jax.jit(function, donate_argnums=(0,) if donate else (), compiler_options=options)
