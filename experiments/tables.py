@@ -69,14 +69,16 @@ def table(found: list[dict[str, Any]]) -> str:
     return "\n".join([*_HEAD, *map(row, found), "", f"Measured on: {'; '.join(machines)}."])
 
 
-def speed(physics: dict[str, Any], train: dict[str, Any]) -> str:
-    """Returns the table of speeds, from what both benchmarks printed."""
+def speed(physics: dict[str, Any], train: dict[str, Any], family: dict[str, Any]) -> str:
+    """Returns the table of speeds, from what the benchmarks printed."""
     shares = ", ".join(f"{name} {share:.0%}" for name, share in train["shares"].items())
     rows = {
         "training, control steps/s": f"{train['control_steps_per_s']:.0f} ({shares})",
         "`cpu` physics inside jit, steps/s": f"{physics['cpu_steps_per_s']:.0f}",
         "the same, as a share of a bare C loop": f"{physics['cpu_over_bare']:.2f}",
         "`mjx` on this CPU, as a share of a bare C loop": f"{physics['mjx_over_bare']:.3f}",
+        f"family of skills with {family['elites']} elites: elites, parameterisation and curriculum,"
+        " as a share of an update": f"{family['overhead']:.1%}",
     }
     lines = [f"| {name} | {value} |" for name, value in rows.items()]
     return "\n".join(["| speed | |", "|---|---|", *lines])
@@ -123,7 +125,8 @@ def _measured(record: dict[str, Any]) -> list[str]:
 
 def trainings() -> str:
     """Returns the tables of trainings and of speed."""
-    benchmarks = [json.loads((BENCHMARKS / f"{n}.json").read_text()) for n in ("physics", "train")]
+    names = "physics", "train", "family"
+    benchmarks = [json.loads((BENCHMARKS / f"{name}.json").read_text()) for name in names]
     found = [record for record in records(RESULTS) if not family_tables.is_family(record)]
     return f"{table(found)}\n\n{speed(*benchmarks)}"
 
