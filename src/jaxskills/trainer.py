@@ -68,7 +68,8 @@ def for_family(config: TrainConfig = TrainConfig()) -> TrainConfig:
     """Returns a configuration with what FS sets otherwise than SB, for the recipe of a family.
 
     Rewards of FS 4.2, time warp of 4.1; the noise of exploration is that of the authors' code,
-    since with SB's a family does not find what lies beyond its region.
+    since with SB's a family does not find what lies beyond its region. These and the number of
+    environments are set whatever `config` has; the rest of it stays.
     """
     env = dataclasses.replace(config.env, reward="tracking", time_warp=True)
     networks = dataclasses.replace(config.networks, noise=0.1)

@@ -301,7 +301,8 @@ def validate(spec: TaskSpec) -> None:
     """Checks a specification.
 
     Raises:
-      UserError: a name twice, a range out of order, neither or both of measure and condition.
+      UserError: a name twice, a range out of order, neither measure nor condition, a constraint
+        with a condition, a sigma or a reach out of range.
     """
     names = [p.name for p in spec.parameters]
     if not 1 <= spec.reach < math.inf:
