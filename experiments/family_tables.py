@@ -101,11 +101,8 @@ def _success(found: dict[str, Any] | None) -> str:
 
 
 def _errors(found: dict[str, Any] | None) -> str:
-    shown = {
-        name: f"{error['mean']:.1%}" if error["relative"] else f"{error['mean']:.2f}"
-        for name, error in ((found or {}).get("errors") or {}).items()
-    }
-    return ", ".join(f"{name} {text}" for name, text in shown.items())
+    shown = ((found or {}).get("errors") or {}).items()
+    return ", ".join(f"{name} {error['share']:.1%}" for name, error in shown)
 
 
 def _range(ends: list[float] | None) -> str:

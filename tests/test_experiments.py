@@ -92,8 +92,8 @@ FAMILY = RECORD | {
         "success_rate": 0.98,
         "episodes": 50,
         "errors": {
-            "rotation": {"mean": 0.0312, "p95": 0.08, "relative": True},
-            "angle": {"mean": 0.0312, "p95": 0.08, "relative": False},
+            "rotation": {"mean": 0.0312, "p95": 0.08, "relative": True, "share": 0.0312},
+            "angle": {"mean": 0.0312, "p95": 0.08, "relative": False, "share": 0.0104},
         },
         "explored_ranges": {"rotation": [0.725, 1.3], "angle": None},
     },
@@ -105,7 +105,7 @@ def test_a_row_of_the_table_of_families():
     assert tables.is_family(FAMILY) and not tables.is_family(RECORD)
     assert tables.row(FAMILY) == (
         "| pivot | 0 | 0.046 M | 0.120 M | 0.93 | 1.00 | 98% of 50 | failed"
-        " | rotation 3.1%, angle 0.03 | 2 |"
+        " | rotation 3.1%, angle 1.0% | 2 |"
     )
     assert tables.table([FAMILY]).splitlines()[1].count("---") == 10
 
@@ -117,7 +117,7 @@ def test_a_comparison_of_families():
     assert lines[0].endswith("| explored angle | explored rotation | minutes |")
     assert lines[2] == "| A1 | 0.020 M | 0.50 | never | failed |  | nothing | nothing | 2 |"
     assert lines[3] == (
-        "| A3 | 0.046 M | 0.93 | 0.046 M | 98% of 50 | rotation 3.1%, angle 0.03"
+        "| A3 | 0.046 M | 0.93 | 0.046 M | 98% of 50 | rotation 3.1%, angle 1.0%"
         " | nothing | 0.72 to 1.30 | 2 |"
     )
 

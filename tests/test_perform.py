@@ -12,7 +12,9 @@ import tiny_family
 from PIL import Image
 
 from jaxskills import evaluate_family, families, perform, playback_family, runs
+from jaxskills.env import measure
 from jaxskills.env.bounds import BoundsConfig
+from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.errors import UserError
 from jaxskills.evaluate_family import FamilyEvaluateConfig
 from jaxskills.explore import family as family_lib
@@ -102,6 +104,7 @@ def test_figures(trained: tuple[Trainer, TrainState], done: Performances):
     error = found["errors"]["height"]
     assert set(found["errors"]) == {"height"} and error["relative"]
     assert error["mean"] == pytest.approx(0.3 / 1.3 / 2, abs=1e-5)
+    assert error["share"] == error["mean"]
     assert error["p95"] == pytest.approx(0.95 * 0.3 / 1.3, abs=1e-5)
     assert (found["training_episodes"], found["episodes"]) == (1234, 3)
     second = found["performances"][1]
@@ -113,6 +116,20 @@ def test_figures(trained: tuple[Trainer, TrainState], done: Performances):
     nobody = dataclasses.replace(known, through=jnp.zeros(3, bool))
     none = evaluate_family.summary(*trained, nobody)
     assert none["errors"] == {} and "fitness_mean" not in none
+
+
+def test_an_absolute_error_is_also_a_share_of_the_range():
+    """By hand: off by 0.2 and 0.1 of a range 3 rad wide."""
+    turned = measure.change(measure.turning("root"), 0.0, 1.0)
+    spec = TaskSpec((Parameter("angle", (-1.5, 1.5), turned, relative=False),))
+    asked, met = np.array([[0.5], [0.6]]), np.array([[0.7], [0.5]])
+    error = evaluate_family.errors(spec, asked, met)["angle"]
+    assert error["mean"] == pytest.approx(0.45) and error["share"] == pytest.approx(0.15)
+    found = {"errors": {"angle": error}, "explored_ranges": {}}
+    expected = (
+        "error of angle               0.45 in the mean (15.0% of the range), 95 % below 0.585"
+    )
+    assert evaluate_family.lines(found) == [expected]
 
 
 def test_what_is_explored(trained: tuple[Trainer, TrainState]):

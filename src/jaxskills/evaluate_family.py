@@ -93,15 +93,17 @@ def errors(spec: TaskSpec, asked: np.ndarray, met: np.ndarray) -> dict[str, dict
     """Returns by measured parameter how far `met [E, P]` is from `asked [E, P]`, both normalised.
 
     `mean` and `p95`, the 95th percentile; `relative` says whether they are shares of what was asked
-    for, or in the unit of the range.
+    for, or in the unit of the range. `share` is the mean as a share of one or the other.
     """
     found = {}
     for parameter, wanted, got in _pairs(spec, asked, met):
         off = np.abs(got - wanted) / (np.abs(wanted) if parameter.relative else 1.0)
+        width = 1.0 if parameter.relative else parameter.range[1] - parameter.range[0]
         found[parameter.name] = {
             "mean": float(off.mean()),
             "p95": float(np.quantile(off, 0.95)),
             "relative": parameter.relative,
+            "share": float(off.mean() / width),
         }
     return found
 
@@ -156,7 +158,8 @@ def lines(found: dict[str, Any]) -> list[str]:
             f"{error[key]:.1%}" if error["relative"] else f"{error[key]:.3g}"
             for key in ("mean", "p95")
         )
-        rows.append(f"{'error of ' + name:28} {mean} in the mean, 95 % below {worst}")
+        share = "" if error["relative"] else f" ({error['share']:.1%} of the range)"
+        rows.append(f"{'error of ' + name:28} {mean} in the mean{share}, 95 % below {worst}")
     for name, ends in found["explored_ranges"].items():
         text = "nothing yet" if ends is None else f"{ends[0]:.3g} to {ends[1]:.3g}"
         rows.append(f"{'explored ' + name:28} {text}")
