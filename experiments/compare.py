@@ -4,12 +4,14 @@
     python experiments/compare.py backflip_starts [--runs runs]
 
 Records and film strips are written to `experiments/results/NAME/`; a case whose record is there is
-left out, a run that was cut off goes on. `experiments/tables.py` makes the tables of
-`experiments/README.md`, which says what each comparison is for and what it costs.
+left out, that of the same training elsewhere is copied, and a run that was cut off goes on.
+`experiments/tables.py` makes the tables of `experiments/README.md`, which says what each comparison
+is for and what it costs.
 """
 
 import argparse
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +25,7 @@ class Case(NamedTuple):
     skill: str
     options: tuple[str, ...] = ()  # of `jaxskills train`, besides the recipe's
     against: tuple[str, ...] = ()  # clips from whose style it is measured how far the skill is
+    after: str = ""  # NAME/LABEL of the case whose networks it begins with
 
 
 def _of(text: str) -> tuple[str, ...]:
@@ -36,6 +39,8 @@ _DEEPMIMIC = f"{_IMITATION} --starts.uniform 1 --env.no-feedforward"
 _TIGHT = "--bounds.com 0.15 0.15 0.1 --bounds.root 0.35 --bounds.joints 0.35"
 _LOOSE = "--bounds.com 0.6 0.6 0.4 --bounds.root 1.4 --bounds.joints 1.4"
 
+_ADAPTIVE = "--adaptive-bounds.enabled"
+
 
 def _poor(skill: str, samples: int) -> dict[str, Case]:
     most = f"--samples {samples} "
@@ -47,31 +52,32 @@ def _poor(skill: str, samples: int) -> dict[str, Case]:
     }
 
 
-def _styles(skill: str, samples: int) -> dict[str, Case]:
+# The skill without a style is learnt first, and each style begins with its networks.
+_STYLED = "--samples 1000000 --no-stop-when-learnt"
+
+
+def _styles(name: str, skill: str, samples: int) -> dict[str, Case]:
     """The styles of SB 5.3.1; a recipe for styles has loose bounds, and is plain without one."""
-    most = f"--samples {samples} --no-stop-when-learnt"
-    cases = {"plain": Case(skill, _of(most))}
+    cases = {"plain": Case(skill, _of(f"--samples {samples}"))}
     for style in ("energy_up", "energy_down", "volume_up", "volume_down"):
-        reward = f" --env.reward style --env.style.style {style}"
-        cases[style] = Case(skill, _of(most + reward))
+        how = f"{_STYLED} --env.reward style --env.style.style {style}"
+        cases[style] = Case(skill, _of(how), after=f"{name}/plain")
     return cases
 
 
-def _transfers(skill: str, clips: tuple[str, ...], samples: int) -> dict[str, Case]:
+def _transfers(name: str, skill: str, clips: tuple[str, ...], samples: int) -> dict[str, Case]:
     """The style transfer of SB 5.3.2, and the skill without it in the same bounds."""
-    most = f"--samples {samples} --no-stop-when-learnt"
-    gram = f"{most} --env.reward style --env.style.style gram --env.style.style-clip"
-    cases = {"plain": Case(skill, _of(most), clips)}
-    return cases | {name: Case(skill, _of(f"{gram} {name}"), clips) for name in clips}
+    gram = f"{_STYLED} --env.reward style --env.style.style gram --env.style.style-clip"
+    cases = {"plain": Case(skill, _of(f"--samples {samples}"), clips)}
+    styled = {one: Case(skill, _of(f"{gram} {one}"), clips, f"{name}/plain") for one in clips}
+    return cases | styled
 
 
-def _blends(skill: str, style: str, samples: int) -> dict[str, Case]:
+def _blends(skill: str, style: str, after: str) -> dict[str, Case]:
     """SB Table 2: no bounds, imitation and style weighted."""
-    how = f"--samples {samples} --no-stop-when-learnt --env.reward blend --env.stop fall"
+    how = f"{_STYLED} --env.reward blend --env.stop fall --env.style.style {style}"
     return {
-        f"weight_{weight}": Case(
-            skill, _of(f"{how} --env.style.style {style} --env.style-weight {weight}")
-        )
+        f"weight_{weight}": Case(skill, _of(f"{how} --env.style-weight {weight}"), after=after)
         for weight in (0.5, 0.6, 0.7, 0.8)
     }
 
@@ -102,10 +108,10 @@ def _curricula(skill: str, samples: int) -> dict[str, Case]:
     return {name: Case(skill, _of(f"{how} {method}")) for name, method in methods.items()}
 
 
-def _switched(skill: str, samples: int, on: str, off: str, option: str) -> dict[str, Case]:
-    """A family as it is, and with one option."""
+def _switched(skill: str, samples: int, without: str, label: str, option: str) -> dict[str, Case]:
+    """A skill or a family as it is, and with one option."""
     how = f"--samples {samples}"
-    return {on: Case(skill, _of(how)), off: Case(skill, _of(f"{how} {option}"))}
+    return {without: Case(skill, _of(how)), label: Case(skill, _of(f"{how} {option}"))}
 
 
 COMPARISONS: dict[str, dict[str, Case]] = {
@@ -131,12 +137,14 @@ COMPARISONS: dict[str, dict[str, Case]] = {
         "default": Case("cartwheel", _of("--samples 4000000")),
         "loose": Case("cartwheel", _of(f"--samples 4000000 {_LOOSE} --bounds.end-effectors 1")),
     },
+    "run_adaptive": _switched("run", 4_000_000, "fixed", "adaptive", _ADAPTIVE),
+    "cartwheel_adaptive": _switched("cartwheel", 4_000_000, "fixed", "adaptive", _ADAPTIVE),
     "sparse_jog": _poor("sparse_jog", 2_000_000),
     "sparse_high_knees": _poor("sparse_high_knees", 2_000_000),
-    "cartwheel_styles": _styles("cartwheel_style", 2_500_000),
-    "dance_styles": _styles("dance_style", 3_500_000),
-    "run_styles": _transfers("run_style", ("happy_walk", "bent_walk"), 2_500_000),
-    "cartwheel_blend": _blends("cartwheel", "energy_down", 2_500_000),
+    "cartwheel_styles": _styles("cartwheel_styles", "cartwheel_style", 4_000_000),
+    "dance_styles": _styles("dance_styles", "dance_style", 5_000_000),
+    "run_styles": _transfers("run_styles", "run_style", ("happy_walk", "bent_walk"), 4_000_000),
+    "cartwheel_blend": _blends("cartwheel_style", "energy_down", "cartwheel_styles/plain"),
     # Families of skills
     "spinkick_ablation": _ablation("spinkick_family", 10_000_000),
     "jump_ablation": _ablation("jump_gravity_family", 10_000_000),
@@ -160,10 +168,27 @@ def main() -> None:
             if (RESULTS / name / f"{label}.json").is_file():
                 print(f"{name}/{label} is there", file=sys.stderr)
                 continue
-            run = options.runs / name / label
-            record = reproduce(case.skill, 0, run, case.options)
+            if earlier := same(case):
+                (RESULTS / name).mkdir(parents=True, exist_ok=True)
+                for path in RESULTS.glob(f"{earlier}.*"):
+                    shutil.copy(path, RESULTS / name / f"{label}{path.suffix}")
+                print(f"{name}/{label} is the same training as {earlier}", file=sys.stderr)
+                continue
+            run, begin = options.runs / name / label, ()
+            if case.after:
+                begin = "--init-from", str(options.runs / case.after)
+            record = reproduce(case.skill, 0, run, (*case.options, *begin))
             record["gram_distances"] = {clip: gram_distance(run, clip) for clip in case.against}
             keep(record, run, RESULTS / name, label)
+
+
+def same(case: Case) -> str | None:
+    """Returns `NAME/LABEL` of a record that is there of the same training, if any."""
+    for name, cases in COMPARISONS.items():
+        for label, other in cases.items():
+            if other == case and (RESULTS / name / f"{label}.json").is_file():
+                return f"{name}/{label}"
+    return None
 
 
 def gram_distance(run: Path, clip: str) -> float | None:

@@ -64,8 +64,10 @@ def reproduce(skill: str, seed: int, run: Path, options: tuple[str, ...] = ()) -
         raise SystemExit(code)
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     last = rows[-1]
+    folders = [i + 1 for i, word in enumerate(options) if word in ("--out", "--init-from")]
+    shown = [f"runs/{Path(x).name}" if i in folders else x for i, x in enumerate(options)]
     record = {
-        "command": shlex.join(["jaxskills", *options[:-1], f"runs/{run.name}"]),
+        "command": shlex.join(["jaxskills", *shown]),
         "skill": skill,
         "seed": seed,
         "exit_code": code,

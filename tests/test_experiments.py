@@ -172,7 +172,34 @@ def test_each_comparison_can_be_trained():
             command = ["train", case.skill, "--out", "nowhere", *case.options]
             _, config = cli.parse(command)
             assert config.samples < 50e6, (name, label)
+            first, _, other = case.after.partition("/")
+            assert not other or not script("compare").COMPARISONS[first][other].after
             (families if config.task else trainer).validate(config)
+
+
+def test_the_same_training_is_done_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The walk of two comparisons, and one beside it that is another training."""
+    made, done = script("compare"), []
+    plain, other = made.Case("walk", ("--samples", "9")), made.Case("walk", after="a/x")
+    monkeypatch.setattr(made, "COMPARISONS", {"a": {"x": plain}, "b": {"y": plain, "z": other}})
+    monkeypatch.setattr(made, "RESULTS", tmp_path)
+    monkeypatch.setattr("sys.argv", ["compare.py", "a", "b", "--runs", str(tmp_path / "runs")])
+
+    def train(skill: str, seed: int, run: Path, options: tuple[str, ...]) -> dict:
+        done.append((run.name, options))
+        run.mkdir(parents=True)
+        (run / "walk.png").write_text(run.name)
+        return {"made": run.name}
+
+    monkeypatch.setattr(made, "reproduce", train)
+    made.main()
+    begin = "--init-from", str(tmp_path / "runs" / "a" / "x")
+    assert done == [("x", plain.options), ("z", begin)]
+    found = [json.loads((tmp_path / path).read_text())["made"] for path in ("a/x.json", "b/y.json")]
+    assert found == ["x", "x"]
+    assert [(tmp_path / f"b/{label}.png").read_text() for label in "yz"] == ["x", "z"]
+    made.main()
+    assert len(done) == 2
 
 
 def test_deepmimic_is_imitation_until_a_fall_without_anything_of_ours():
@@ -197,6 +224,18 @@ def test_an_interrupted_training_is_not_recorded(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(made, "train", lambda options: (130, 1.0, None))
     with pytest.raises(SystemExit, match="130"):
         made.reproduce("walk", 0, tmp_path)
+
+
+def test_a_record_names_no_folder_of_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = script("reproduce")
+    monkeypatch.setattr(made, "train", lambda options: (0, 1.0, None))
+    monkeypatch.setattr(made, "jaxskills", lambda *options: "")
+    run = tmp_path / "some" / "like"
+    run.mkdir(parents=True)
+    (run / "metrics.jsonl").write_text('{"samples": 5, "wall_s": 1.0}\n')
+    record = made.reproduce("run", 0, run, ("--init-from", str(tmp_path / "some" / "plain")))
+    expected = "jaxskills train run --seed 0 --init-from runs/plain --out runs/like"
+    assert record["command"] == expected
 
 
 def test_where_a_record_was_made(tmp_path: Path):

@@ -241,3 +241,9 @@ def test_a_skill_that_stands_is_learnt_and_the_run_ends(config: TrainConfig, tmp
     assert last["seconds_mean"] > 18.0
     assert _lines(tmp_path / "run")[-1]["success_rate"] == last["success_rate"]
     assert checkpoint.existing(tmp_path / "run") == [last["samples"]]
+    lines = _lines(tmp_path / "run")
+    _, _, again = train.train(easy, tmp_path / "run", _quiet, resume=True)
+    assert again == last and _lines(tmp_path / "run") == lines
+    further = dataclasses.replace(easy, samples=last["samples"] + 1, stop_when_learnt=False)
+    _, _, again = train.train(further, tmp_path / "run", _quiet, resume=True)
+    assert again["samples"] > last["samples"] and again["why"] == "samples used up"

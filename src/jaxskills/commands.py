@@ -274,9 +274,9 @@ def _located(config: TrainConfig) -> TrainConfig:
         for name, value in (("style_clip", style.style_clip), ("autoencoder", style.autoencoder))
     }
     env = dataclasses.replace(config.env, style=dataclasses.replace(style, **files))
-    return dataclasses.replace(
-        config, env=env, clip=_absolute(config.clip), character=_absolute(config.character)
-    )
+    files = {name: _absolute(getattr(config, name)) for name in ("clip", "character")}
+    begin = None if config.init_from is None else str(Path(config.init_from).absolute())
+    return dataclasses.replace(config, env=env, init_from=begin, **files)
 
 
 def _absolute(name: str) -> str:

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from jaxskills import checkpoint, families, paths, trainer
+from jaxskills import checkpoint, families, paths, trainer, transfer
 from jaxskills import judge as judge_lib
 from jaxskills.compilation import jit
 from jaxskills.errors import UserError
@@ -41,14 +41,15 @@ def train(
       config: all settings; on `resume` those that the run began with, or changed by the user.
       run: folder to write to.
       report: called with every line of metrics.
-      resume: go on from the newest checkpoint.
+      resume: go on from the newest checkpoint; a run that is learnt is over, with equal settings.
 
     Returns:
       The trainer, the last state, which is saved, and the last metrics; their entry `why` is
       "learnt", "samples used up" or "interrupted".
 
     Raises:
-      UserError: bad settings, or a run folder that is in use or cannot be resumed.
+      UserError: bad settings, a run folder that is in use or cannot be resumed, or no such run to
+        begin with.
     """
     begin = time.monotonic()
     made = families.make(config)
@@ -56,11 +57,16 @@ def train(
     if resume:
         state = checkpoint.restore(run, made)
         history = _rewind(run, int(state.samples))
+        if history and history[-1].get("learnt") and config == checkpoint.read_config(run):
+            return made, state, history[-1] | {"why": "learnt"}
         now = trainer.refined(made) if state.refinement.fine else made
         update = jit(now.update, donate=True)
     else:
         _claim(run)
+        taught = None if config.init_from is None else transfer.read(made, config.init_from)
         state, update = _begin(made)
+        if taught is not None:
+            state = transfer.begin(state, taught)
     checkpoint.write_config(run, config)
     with _stop_signal() as stopped:
         state, last = _loop(made, update, run, state, history, begin, report, stopped)
@@ -120,6 +126,7 @@ def _loop(
                     last |= judge(state, last)
                 if judge.learnt:
                     why = "learnt"
+                    last["learnt"] = True
                 lines.write(json.dumps(last) + "\n")
                 lines.flush()
                 _to_board(board, last)

@@ -48,6 +48,7 @@ class TrainConfig:
     character: str = "humanoid34"
     backend: Literal["auto", "cpu", "mjx", "warp"] = "auto"
     seed: int = 0
+    init_from: str | None = None  # a run whose networks it begins with; None: untrained ones
     samples: int = 10_000_000  # at most; training stops before when the skill is learnt
     envs: int = 128
     stop_when_learnt: bool = True  # 20 s without a fall, at 600 Hz physics too; see judge.py
