@@ -5,10 +5,10 @@ A variation is K rows at even knots of phase, from 0 to the motion's length: a d
 pose and the log of the speed at which phase goes by. Both are linear between knots. A row of zeros
 is the reference itself, at its own speed of one control frame of phase per control frame.
 
-A motion that loops is varied over its one cycle, each time alike, and its ends have to meet. It
-may travel another distance in each cycle: that goes into the step from cycle to cycle. What else
-differs between the last knot and the first (height, orientation, joints, speed) is spread evenly
-over the cycle, so that both ends meet half way; a variation without such a gap stays as it is.
+A motion that loops is varied over its one cycle, and the next cycle begins where that has led to:
+there, as high, and heading that way. Its ends are not made to meet, or else a jump onto a box would
+end half on the box, and a longer turn would turn by half of the rest. So joints and tilt jump from
+the last knot to the first, where one cycle goes over into the next.
 """
 
 import dataclasses
@@ -71,12 +71,12 @@ def displace(layout: pose.Layout, motion: Motion, variation: Variation) -> Motio
     phase, times the speed of phase. Its length stays one of phase; `duration` has the seconds.
     Where the displacement is one of the character alone (`Layout.own`), objects keep their paths.
     """
-    variation, step = _performed(motion, variation)
+    variation = _limited(variation)
     share = jnp.linspace(0.0, 1.0, motion.qpos.shape[0])
     d = _between(variation.d, share)
     if d.shape[1] < layout.nv:
         d = jnp.pad(d, ((0, 0), (0, layout.nv - d.shape[1])))
-    slope = _slopes(motion, d, step)
+    slope = _slopes(motion, d)
     qpos = pose.plus(layout, motion.qpos, d)
 
     def onward(time: jax.Array) -> jax.Array:
@@ -85,8 +85,9 @@ def displace(layout: pose.Layout, motion: Motion, variation: Variation) -> Motio
 
     _, qvel = jax.jvp(onward, (jnp.float32(0.0),), (jnp.float32(1.0),))
     speed = jnp.exp(_between(variation.tau, share))
+    yaw, pos = _next_cycle(motion, qpos) if motion.loop else (motion.cycle_yaw, motion.cycle_pos)
     return dataclasses.replace(
-        motion, qpos=qpos, qvel=speed[:, None] * qvel, cycle_pos=motion.cycle_pos + step
+        motion, qpos=qpos, qvel=speed[:, None] * qvel, cycle_yaw=yaw, cycle_pos=pos
     )
 
 
@@ -95,7 +96,7 @@ def rate(motion: Motion, variation: Variation, phase: jax.Array) -> jax.Array:
 
     That is exp(tau), in every cycle of a loop; beyond the ends of another motion it is as there.
     """
-    variation, _ = _performed(motion, variation)
+    variation = _limited(variation)
     share = phase / motion.length
     share = share - jnp.floor(share) if motion.loop else jnp.clip(share, 0.0, 1.0)
     return jnp.exp(_between(variation.tau, share))
@@ -107,7 +108,7 @@ def duration(motion: Motion, variation: Variation) -> jax.Array:
     It is the integral of exp(-tau) over phase. Control steps of FS eq. 3 take it with the speed at
     their beginning, and so differ by a fraction of a step.
     """
-    tau = _performed(motion, variation)[0].tau
+    tau = _limited(variation).tau
     rise = tau[1:] - tau[:-1]
     even = jnp.abs(rise) < 1e-2
     slowness = jnp.where(
@@ -163,38 +164,35 @@ def _between(knots: jax.Array, share: jax.Array) -> jax.Array:
     return knots[low] + part * (knots[low + 1] - knots[low])
 
 
-def _performed(motion: Motion, variation: Variation) -> tuple[Variation, jax.Array]:
-    """Returns the variation with speeds in their limits and a loop's ends met.
+def _limited(variation: Variation) -> Variation:
+    """Returns the variation with speeds in their limits."""
+    return Variation(variation.d, jnp.clip(variation.tau, -TAU_LIMIT, TAU_LIMIT))
 
-    Also what it adds `[3]` to the step from one cycle to the next (m).
+
+def _next_cycle(motion: Motion, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns by how much a cycle turns `[]` and moves `[3]` the next, for the poses `[F, nq]`.
+
+    The root of the first pose is put where that of the last one is, turned about the vertical to
+    come nearest to it. Told as a change from the reference's own, which it stays without any.
     """
-    d, tau = variation.d, jnp.clip(variation.tau, -TAU_LIMIT, TAU_LIMIT)
-    if not motion.loop:
-        return Variation(d, tau), jnp.zeros(3)
-    gap = d[-1] - _turned(d[0], motion.cycle_yaw)
-    level = jnp.array([1.0, 1.0, 0.0])
-    step = level * gap[:3]
-    gap = gap.at[:3].add(-step)
-    back = 0.5 - jnp.linspace(0.0, 1.0, d.shape[0])
-    return Variation(d + back[:, None] * gap, tau + back * (tau[-1] - tau[0])), step
+
+    def heading(poses: jax.Array) -> jax.Array:
+        apart = rotation.mul(poses[-1, 3:7], rotation.inv(poses[0, 3:7]))
+        return 2.0 * jnp.arctan2(apart[3], apart[0])
+
+    def step(poses: jax.Array, yaw: jax.Array) -> jax.Array:
+        return poses[-1, :3] - rotation.rotate(rotation.about_z(yaw), poses[0, :3])
+
+    turn = heading(qpos) - heading(motion.qpos)
+    yaw = motion.cycle_yaw + turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))
+    return yaw, motion.cycle_pos + step(qpos, yaw) - step(motion.qpos, motion.cycle_yaw)
 
 
-def _turned(d: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Returns a displacement `[nv]` in a world turned by `yaw`: only the root's shift is in it."""
-    return jnp.concatenate((rotation.rotate(rotation.about_z(yaw), d[:3]), d[3:]))
-
-
-def _slopes(motion: Motion, d: jax.Array, step: jax.Array) -> jax.Array:
+def _slopes(motion: Motion, d: jax.Array) -> jax.Array:
     """Returns how displacements `d [F, nv]` change per second at normal speed.
 
-    Central differences, across the seam of a loop, else one-sided at the ends.
+    Central differences, one-sided at the ends.
     """
-    if motion.loop:
-        shift = jnp.zeros(d.shape[1]).at[:3].set(step)
-        before = _turned(d[-2] - shift, -motion.cycle_yaw)
-        after = _turned(d[1], motion.cycle_yaw) + shift
-    else:
-        before, after = 2.0 * d[0] - d[1], 2.0 * d[-1] - d[-2]
-    around = jnp.concatenate((before[None], d, after[None]))
+    around = jnp.concatenate(((2.0 * d[0] - d[1])[None], d, (2.0 * d[-1] - d[-2])[None]))
     frame = motion.length * CONTROL_DT / (d.shape[0] - 1)
     return (around[2:] - around[:-2]) / (2.0 * frame)
