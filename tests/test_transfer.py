@@ -79,3 +79,4 @@ def test_a_folder_that_is_no_run_is_refused(config: TrainConfig, tmp_path: Path)
     nowhere = dataclasses.replace(config, init_from=str(tmp_path / "nowhere"))
     with pytest.raises(UserError, match="nowhere' is not a run"):
         train.train(nowhere, tmp_path / "run", lambda metrics: None)
+    assert not (tmp_path / "run").exists()

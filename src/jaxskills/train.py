@@ -62,8 +62,8 @@ def train(
         now = trainer.refined(made) if state.refinement.fine else made
         update = jit(now.update, donate=True)
     else:
-        _claim(run)
         taught = None if config.init_from is None else transfer.read(made, config.init_from)
+        _claim(run)
         state, update = _begin(made)
         if taught is not None:
             state = transfer.begin(state, taught)
