@@ -33,7 +33,7 @@ explore.starts explore.evolution explore.adaptive explore.refine explore.fitness
 explore.parameterization explore.marginal explore.sampling explore.curriculum explore.family
 explore.episodes explore
 
-trainer recipes families checkpoint runs transfer evaluate perform evaluate_family controller
+trainer recipes families checkpoint runs warm_start evaluate perform evaluate_family controller
 style_measures judge train
 render.opengl render.stage render.take render.video render.several render.strip render
 plot.sheet plot.lines plot.states plot.training plot.starts plot.family plot

@@ -97,13 +97,13 @@ def errors(spec: TaskSpec, asked: np.ndarray, met: np.ndarray) -> dict[str, dict
     """
     found = {}
     for parameter, wanted, got in _pairs(spec, asked, met):
-        off = np.abs(got - wanted) / (np.abs(wanted) if parameter.relative else 1.0)
-        width = 1.0 if parameter.relative else parameter.range[1] - parameter.range[0]
+        share = _share(parameter, wanted, got)
+        off = share if parameter.relative else np.abs(got - wanted)
         found[parameter.name] = {
             "mean": float(off.mean()),
             "p95": float(np.quantile(off, 0.95)),
             "relative": parameter.relative,
-            "share": float(off.mean() / width),
+            "share": float(share.mean()),
         }
     return found
 
@@ -114,9 +114,14 @@ def shares(made: Trainer, asked: np.ndarray, met: np.ndarray) -> dict[str, np.nd
     As a share of what was asked for, or of the range where that is absolute.
     """
     return {
-        p.name: np.abs(got - wanted) / (np.abs(wanted) if p.relative else p.range[1] - p.range[0])
-        for p, wanted, got in _pairs(task_of(made), asked, met)
+        parameter.name: _share(parameter, wanted, got)
+        for parameter, wanted, got in _pairs(task_of(made), asked, met)
     }
+
+
+def _share(parameter: Parameter, wanted: np.ndarray, got: np.ndarray) -> np.ndarray:
+    low, high = parameter.range
+    return np.abs(got - wanted) / (np.abs(wanted) if parameter.relative else high - low)
 
 
 def _pairs(

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from tensorboardX import SummaryWriter
 
-from jaxskills import checkpoint, families, paths, trainer, transfer
+from jaxskills import checkpoint, families, paths, trainer, warm_start
 from jaxskills import judge as judge_lib
 from jaxskills.compilation import jit
 from jaxskills.errors import UserError
@@ -62,11 +62,11 @@ def train(
         now = trainer.refined(made) if state.refinement.fine else made
         update = jit(now.update, donate=True)
     else:
-        taught = None if config.init_from is None else transfer.read(made, config.init_from)
+        taught = None if config.init_from is None else warm_start.read(made, config.init_from)
         _claim(run)
         state, update = _begin(made)
         if taught is not None:
-            state = transfer.begin(state, taught)
+            state = warm_start.begin(state, taught)
     checkpoint.write_config(run, config)
     with _stop_signal() as stopped:
         state, last = _loop(made, update, run, state, history, begin, report, stopped)

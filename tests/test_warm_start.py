@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tiny
 
-from jaxskills import checkpoint, families, train, transfer
+from jaxskills import checkpoint, families, train, warm_start
 from jaxskills.errors import UserError
 from jaxskills.learn.networks import NetworkConfig
 from jaxskills.trainer import TrainConfig
@@ -39,7 +39,7 @@ def test_networks_and_statistics_are_taken_over_and_the_rest_begins_anew(
 ):
     made = families.make(dataclasses.replace(config, seed=5))
     first, last = made.init(jax.random.key(5)), checkpoint.restore(learnt, made)
-    state = transfer.begin(first, transfer.read(made, learnt))
+    state = warm_start.begin(first, warm_start.read(made, learnt))
     theirs = last.learner.policy, last.learner.value, last.normalizer
     for mine, other in zip(
         jax.tree.leaves((state.learner.policy, state.learner.value, state.normalizer)),

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from jaxskills import runs
 from jaxskills.errors import UserError
@@ -47,6 +46,5 @@ def read(made: Trainer, run: str | Path) -> Taught:
 
 def begin(state: TrainState, taught: Taught) -> TrainState:
     """Returns a first state with what was learnt elsewhere; all the rest begins anew."""
-    policy, value, normalizer = jax.tree.map(jnp.copy, taught)
-    learner = dataclasses.replace(state.learner, policy=policy, value=value)
-    return dataclasses.replace(state, learner=learner, normalizer=normalizer)
+    learner = dataclasses.replace(state.learner, policy=taught.policy, value=taught.value)
+    return dataclasses.replace(state, learner=learner, normalizer=taught.normalizer)
