@@ -124,13 +124,13 @@ COMPARISONS: dict[str, dict[str, Case]] = {
         "off": Case("break_dance", _of("--samples 4000000 --evolution.no-enabled")),
     },
     "feedforward": {
-        "with": Case("walk", _of("--samples 4000000")),
-        "without": Case("walk", _of("--samples 4000000 --env.no-feedforward")),
+        "with": Case("walk", _of("--samples 2000000")),
+        "without": Case("walk", _of("--samples 2000000 --env.no-feedforward")),
     },
     "walk_bounds": {
-        "tight": Case("walk", _of(f"--samples 4000000 {_TIGHT} --bounds.end-effectors 0.25")),
-        "default": Case("walk", _of("--samples 4000000")),
-        "loose": Case("walk", _of(f"--samples 4000000 {_LOOSE} --bounds.end-effectors 1")),
+        "tight": Case("walk", _of(f"--samples 2000000 {_TIGHT} --bounds.end-effectors 0.25")),
+        "default": Case("walk", _of("--samples 2000000")),
+        "loose": Case("walk", _of(f"--samples 2000000 {_LOOSE} --bounds.end-effectors 1")),
     },
     "cartwheel_bounds": {
         "tight": Case("cartwheel", _of(f"--samples 4000000 {_TIGHT} --bounds.end-effectors 0.25")),

@@ -167,10 +167,6 @@ def make(
       scenery: puts what stands around the character into the spec.
       things: move beside it.
 
-    Args:
-      config: all settings.
-      character: the configuration's, among the things that stand around it; None: on its own.
-
     Raises:
       UserError: a value out of range, an unknown name, a broken clip or character.
     """
