@@ -133,13 +133,15 @@ def main() -> None:
     parser.add_argument("skills", nargs="+", help="recipes, see `jaxskills train --help`")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where run folders go")
+    parser.add_argument("--samples", type=int, help="of each training at most")
     options = parser.parse_args()
+    most = () if options.samples is None else ("--samples", str(options.samples))
     for skill in options.skills:
         for seed in options.seeds:
             name = Path(skill).stem
             run = options.runs / f"{name}-{seed}"
             strip = name if seed == options.seeds[0] else ""
-            keep(reproduce(skill, seed, run), run, RESULTS, strip)
+            keep(reproduce(skill, seed, run, most), run, RESULTS, strip)
 
 
 if __name__ == "__main__":

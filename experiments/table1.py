@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """SB Table 1: how many samples until a skill stands 20 s without a fall, ours and the paper's.
 
-    python experiments/table1.py [--only dance roll] [--runs runs]
+    python experiments/table1.py [--only dance roll] [--samples 5000000] [--runs runs]
 
 Trains every skill of the table with its recipe, survival reward only, the first two with three
 seeds. A skill whose record is there already is left out; a run that was cut off goes on. `run_jump`
@@ -32,9 +32,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=SKILLS, default=list(SKILLS))
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where run folders go")
+    parser.add_argument("--samples", type=int, help="of each training at most; else the paper's")
     options = parser.parse_args()
     for skill in options.only:
         seeds, samples = SKILLS[skill]
+        samples = min(samples, options.samples or samples)
         for seed in seeds:
             run = options.runs / f"{skill}-{seed}"
             if (RESULTS / f"{run.name}.json").is_file():
