@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxskills import character, paths
+from jaxskills.errors import UserError
 
 NAMES = ("humanoid34", "human21", "atlas")
 SIDES = (("left_", "right_"), ("Left", "Right"), ("l_", "r_"))
@@ -285,3 +286,12 @@ def _local_turn(name, frame):
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     # R = I + 2 (w K + K K) / |q|^2 holds for quaternions that are not of unit length, too.
     return np.eye(3) + 2.0 * (w * cross + cross @ cross) / (quat @ quat)
+
+
+def test_bodies_by_pattern():
+    who = character.load("humanoid34")
+    assert who.bodies(("*",)) == set(range(15))
+    names = {who.body_names[i] for i in who.bodies(("*_knee", "root"))}
+    assert names == {"right_knee", "left_knee", "root"}
+    with pytest.raises(UserError, match=r"unknown body of humanoid34 '\*_toe': choose one of root"):
+        who.bodies(("root", "*_toe"))

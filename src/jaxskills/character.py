@@ -7,8 +7,9 @@ follow from the mass and leaf bodies are the end effectors.
 """
 
 import dataclasses
+import fnmatch
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,6 +98,18 @@ class Character:
         if name not in self.body_names:
             raise unknown(f"body of {self.name}", name, self.body_names)
         return self.body_names.index(name)
+
+    def bodies(self, patterns: Iterable[str]) -> frozenset[int]:
+        """Returns the indices of the bodies whose name is one of `patterns`, as in `*_knee`.
+
+        Raises:
+          UserError: a pattern that no body matches; the message lists the names.
+        """
+        found: set[int] = set()
+        for pattern in patterns:
+            names = fnmatch.filter(self.body_names, pattern)
+            found |= {self.body(name) for name in names or (pattern,)}
+        return frozenset(found)
 
 
 def available() -> tuple[str, ...]:

@@ -64,7 +64,7 @@ class EnvConfig:
     stop: Literal["bounds", "fall"] = "bounds"  # what ends an episode; DeepMimic: a fall
     torque_limits: bool = True  # off: servos of any strength, FS section 7.4
     once: bool = False  # an episode is over soon after the first cycle of a motion that loops
-    may_touch: tuple[str, ...] | None = None  # bodies that may touch the ground; None: the feet
+    may_touch: tuple[str, ...] | None = None  # the ground: bodies, or `*_knee`; None: the feet
     heading: Literal["forward", "lateral"] = "forward"  # lateral for backflips and rolls, SB 4.1
 
 
@@ -164,7 +164,7 @@ def make(
     lateral = np.cross([0.0, 0.0, 1.0], forward)
     axis = jnp.asarray(forward if config.heading == "forward" else lateral, jnp.float32)
     grounded = character.ground if config.may_touch is None else config.may_touch
-    allowed = {character.body(name) for name in grounded}
+    allowed = character.bodies(grounded)
     no_touch = np.array([i for i in range(len(character.body_names)) if i not in allowed], int)
     forbidden = np.array(bounds.forbidden, int)
     dofs = np.array(servos.dofs)
