@@ -3,10 +3,10 @@
 
     python experiments/compare.py backflip_starts [--runs runs]
 
-Records and film strips are written to `experiments/results/NAME/`; a case whose record is there is
-left out, that of the same training elsewhere is copied, and a run that was cut off goes on.
-`experiments/tables.py` makes the tables of `experiments/README.md`, which says what each comparison
-is for and what it costs.
+Records and film strips are written to `experiments/results/NAME/`. A case whose record is there is
+left out, that of the same training elsewhere is copied, also where `reproduce.py` made it of the
+recipe on such a machine, and a run that was cut off goes on. `experiments/tables.py` makes the
+tables of `experiments/README.md`, which says what each comparison is for and what it costs.
 """
 
 import argparse
@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from reproduce import RESULTS, jaxskills, keep, reproduce
+
+from jaxskills import provenance
+from jaxskills.judge import SURE_RATE
 
 
 class Case(NamedTuple):
@@ -168,11 +171,11 @@ def main() -> None:
             if (RESULTS / name / f"{label}.json").is_file():
                 print(f"{name}/{label} is there", file=sys.stderr)
                 continue
-            if earlier := same(case):
+            if earlier := same(case) or plain(case):
                 (RESULTS / name).mkdir(parents=True, exist_ok=True)
-                for path in RESULTS.glob(f"{earlier}.*"):
+                for path in earlier:
                     shutil.copy(path, RESULTS / name / f"{label}{path.suffix}")
-                print(f"{name}/{label} is the same training as {earlier}", file=sys.stderr)
+                print(f"{name}/{label} is the same training as {earlier[0]}", file=sys.stderr)
                 continue
             run, begin = options.runs / name / label, ()
             if case.after:
@@ -182,13 +185,29 @@ def main() -> None:
             keep(record, run, RESULTS / name, label)
 
 
-def same(case: Case) -> str | None:
-    """Returns `NAME/LABEL` of a record that is there of the same training, if any."""
+def same(case: Case) -> list[Path]:
+    """Returns the files of a record that is there of the same training, none if there is none."""
     for name, cases in COMPARISONS.items():
         for label, other in cases.items():
             if other == case and (RESULTS / name / f"{label}.json").is_file():
-                return f"{name}/{label}"
-    return None
+                return sorted(RESULTS.glob(f"{name}/{label}.*"))
+    return []
+
+
+def plain(case: Case) -> list[Path]:
+    """Returns the files of the record that `reproduce.py` made of the same training, if any.
+
+    That is one of the recipe as it is, learnt within the case's samples, on such a machine.
+    """
+    path = RESULTS / f"{case.skill}-0.json"
+    if case != Case(case.skill, ("--samples", *case.options[1:2])) or not path.is_file():
+        return []
+    record, here = json.loads(path.read_text()), provenance.describe(RESULTS.parent)
+    alike = all(record[name] == here[name] for name in ("processor", "backend", "versions"))
+    learnt = record["curve"][-1].get("fine_success_rate", 0.0) >= SURE_RATE
+    if not (alike and learnt and record["samples"] <= int(case.options[1])):
+        return []
+    return [path, *RESULTS.glob(f"{case.skill}.png")]
 
 
 def gram_distance(run: Path, clip: str) -> float | None:

@@ -44,7 +44,7 @@ RECORD = {
 
 def test_a_row_of_the_table():
     row = script("tables").row(RECORD)
-    assert row == "| walk | 2 | 1.23 M | 4.08 M | 1.5 | 98.4% of 64 | failed |"
+    assert row == "| walk | 2 | 1.23 M | 4.08 M | 1.5 | 2 | 98.4% of 64 | failed |"
 
 
 def test_records_come_in_order(tmp_path: Path):
@@ -200,6 +200,30 @@ def test_the_same_training_is_done_once(tmp_path: Path, monkeypatch: pytest.Monk
     assert [(tmp_path / f"b/{label}.png").read_text() for label in "yz"] == ["x", "z"]
     made.main()
     assert len(done) == 2
+
+
+@pytest.mark.parametrize(
+    ("changed", "taken"),
+    [
+        ({}, True),
+        ({"samples": 11}, False),  # more than the case may have
+        ({"curve": [{"fine_success_rate": 0.9}]}, False),  # not learnt
+        ({"processor": "another"}, False),
+    ],
+)
+def test_the_record_of_a_recipe_serves_as_a_case(
+    changed: dict, taken: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = script("compare")
+    monkeypatch.setattr(made, "RESULTS", tmp_path)
+    here = made.provenance.describe(tmp_path)
+    record = {**here, "samples": 9, "curve": [{}, {"fine_success_rate": 1.0}], **changed}
+    (tmp_path / "walk-0.json").write_text(json.dumps(record))
+    (tmp_path / "walk.png").write_text("strip")
+    found = made.plain(made.Case("walk", ("--samples", "10")))
+    assert [path.name for path in found] == (["walk-0.json", "walk.png"] if taken else [])
+    assert made.plain(made.Case("walk", ("--samples", "10", "--starts.uniform", "1"))) == []
+    assert made.plain(made.Case("run", ("--samples", "10"))) == []
 
 
 def test_deepmimic_is_imitation_until_a_fall_without_anything_of_ours():

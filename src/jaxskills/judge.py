@@ -25,7 +25,7 @@ _EVALUATION_SHARE = 0.2
 _FINE_SHARE = 0.5
 # Of 64 episodes, to stop. A skill is to stand 20 s (SB Table 1) in 95 %, but who stops at that rate
 # stops by luck: in 64 other episodes it comes out lower.
-_SURE_RATE = 0.98
+SURE_RATE = 0.98
 _PROMISING_SECONDS = 2.0  # of survival while exploring, before an evaluation is worth its time
 # A family is learnt when ER (FS Table 1) is 1, rounded, and of 50 new task parameters so many are
 # got through, and done so closely in the mean: as a share of what was asked, or of the range.
@@ -58,10 +58,10 @@ class SkillJudge:
         self._tried = survival
         found, spent = self._evaluate(state, None)
         pause = spent / (_EARLY_SHARE if found["success_rate"] < 0.5 else _EVALUATION_SHARE)
-        if found["success_rate"] >= _SURE_RATE:
+        if found["success_rate"] >= SURE_RATE:
             fine, spent = self._evaluate(state, evaluate.FINE_SUBSTEPS)
             found["fine_success_rate"] = fine["success_rate"]
-            self.learnt = fine["success_rate"] >= _SURE_RATE
+            self.learnt = fine["success_rate"] >= SURE_RATE
             pause += spent / _FINE_SHARE
         self._due = time.monotonic() + pause
         names = ("success_rate", "fine_success_rate", "seconds_mean", "inside_seconds_mean")
