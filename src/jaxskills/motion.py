@@ -42,6 +42,7 @@ class MotionConfig:
 
     close_loop: float = 0.15  # s on either side of the seam over which a loop's gap is spread
     smooth_velocity: float = 0.03  # s, width of the Gaussian that calms spiking velocities
+    ballistic: bool = False  # velocities in flight are those of a thrown body, see `flight`
     start: float = 0.0  # s, where the part of the clip begins that is learnt
     end: float | None = None  # s, where it ends; None: with the clip. A part does not loop
     turn_with_cycle: bool = False  # the heading gained in a cycle is kept (DeepMimic: off)

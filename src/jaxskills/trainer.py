@@ -18,7 +18,7 @@ from flax import struct
 
 from jaxskills import character as character_lib
 from jaxskills import clip as clip_lib
-from jaxskills import levels, objects, pose, retarget
+from jaxskills import flight, levels, objects, pose, retarget
 from jaxskills import motion as motion_lib
 from jaxskills import physics as physics_lib
 from jaxskills.character import Character, Object
@@ -116,6 +116,7 @@ def reference(config: TrainConfig, character: Character) -> Motion:
     clip = clip_lib.cut(clip_lib.load(config.clip), config.motion.start, config.motion.end)
     qpos = retarget.retarget(character, clip)
     made = motion_lib.from_qpos(character.model, qpos, clip.times, clip.loop, config.motion)
+    made = flight.ballistic(character, made) if config.motion.ballistic else made
     return levels.raised(character, made)
 
 
