@@ -83,8 +83,27 @@ def test_wrong_velocities_are_put_right_and_joints_stay(who: Character, thrown: 
     assert off.max() < 0.2 < 1.0 < np.abs(broken.qvel - thrown[1])[:, :6].max()
     np.testing.assert_array_equal(made.qvel[:, 6:], broken.qvel[:, 6:])
     np.testing.assert_array_equal(made.qpos, broken.qpos)
-    momenta = [flight.whole_body(who.model, q, v).angular for q, v in zip(made.qpos, made.qvel)]  # noqa: B905
+    momenta = [
+        flight.whole_body(who.model, q, v).angular
+        for q, v in zip(made.qpos, made.qvel, strict=True)
+    ]
     assert np.ptp(momenta, axis=0).max() < 1e-3
+
+
+def test_take_off_leads_up_to_the_flight(who: Character, thrown: tuple):
+    """The walker stands before it: turning gathers, and so does what is level, not upwards."""
+    ground = np.tile(tiny.standing(1), (20, 1))
+    plain = _motion(who, np.concatenate((ground, thrown[0])))
+    made = flight.ballistic(who, plain)
+    states = [flight.whole_body(who.model, q, v) for q, v in zip(made.qpos, made.qvel, strict=True)]
+    dt, wanted = plain.seconds / 44, states[20].angular
+    count = round(0.1 / dt)
+    shares = [s.angular[1] / wanted[1] for s in states[20 - count : 20]]
+    np.testing.assert_allclose(shares[:-1], np.arange(1, count) / (count + 1), atol=0.02)
+    level = [s.velocity[0] / states[20].velocity[0] for s in states[20 - count : 20]]
+    np.testing.assert_allclose(level[:-1], np.arange(1, count) / (count + 1), atol=0.02)
+    np.testing.assert_allclose([s.velocity[2] for s in states[:19]], 0.0, atol=1e-5)
+    np.testing.assert_array_equal(made.qvel[: 20 - count], plain.qvel[: 20 - count])
 
 
 def test_on_the_floor_nothing_changes(who: Character):

@@ -22,6 +22,8 @@ from jaxskills.retarget import posed
 _ROOT = 1  # MuJoCo's body that the character's tree begins with, on a free joint
 _AIRBORNE = 0.02  # m over the floor, of the lowest point; clips are off by that much
 _SHORTEST = 3  # frames
+_TAKE_OFF = 0.1  # s before a flight, in which its momentum is gathered
+_LEVEL = np.array([1.0, 1.0, 0.0])
 
 
 class State(NamedTuple):
@@ -39,7 +41,9 @@ def ballistic(character: Character, motion: Motion) -> Motion:
     """Returns the motion with the velocities of a thrown body wherever nothing is near the floor.
 
     In each flight the centre of mass follows the parabola under gravity that is nearest to the
-    clip's, and the angular momentum is the one that turns the body as far as the clip does.
+    clip's, and the angular momentum is the one that turns the body as far as the clip does. Before
+    it, momentum leads up to that: who takes off with too little of it cannot get it in the air.
+    Upwards it stays the clip's, as feet on the floor give it within a frame or two.
     """
     model, qpos, qvel = character.model, np.array(motion.qpos, float), np.array(motion.qvel, float)
     dt = motion.seconds / (len(qpos) - 1)
@@ -54,6 +58,12 @@ def ballistic(character: Character, motion: Motion) -> Motion:
         angular = np.linalg.solve(np.sum(weights, axis=0), turned)
         for i, t, state in zip(frames, time, states, strict=True):
             qvel[i, :6] += root_change(state, begin + gravity * t, angular)
+        before = range(max(frames.start - round(_TAKE_OFF / dt), 0), frames.start)
+        for i, share in zip(before, np.linspace(0.0, 1.0, len(before) + 2)[1:-1], strict=True):
+            state = whole_body(model, qpos[i], qvel[i])
+            velocity = state.velocity + share * _LEVEL * (begin - state.velocity)
+            more = share * (angular - state.angular)
+            qvel[i, :6] += root_change(state, velocity, state.angular + more)
     return dataclasses.replace(motion, qvel=jnp.asarray(qvel, jnp.float32))
 
 
