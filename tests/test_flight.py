@@ -14,7 +14,8 @@ from jaxskills import flight, kinematics, motion
 from jaxskills.character import Character
 from jaxskills.motion import MotionConfig
 
-FRAMES, SECONDS = 25, 0.4
+FRAMES, DT = 25, 1.0 / 60.0
+GRAVITY = np.array([0.0, 0.0, -9.81])
 PLAIN = MotionConfig(smooth_velocity=0.0)
 
 
@@ -29,7 +30,7 @@ def thrown(who: Character) -> tuple[np.ndarray, np.ndarray]:
     model = copy.copy(who.model)
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
-    model.opt.timestep = SECONDS / (FRAMES - 1) / 20
+    model.opt.timestep = DT / 20
     data, rows = mujoco.MjData(model), []
     data.qpos[:] = tiny.standing(1)[0]
     data.qpos[2] = 3.0
@@ -43,7 +44,8 @@ def thrown(who: Character) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _motion(who: Character, qpos: np.ndarray) -> motion.Motion:
-    return motion.from_qpos(who.model, qpos, np.linspace(0.0, SECONDS, len(qpos)), False, PLAIN)
+    times = DT * np.arange(len(qpos))
+    return motion.from_qpos(who.model, qpos, times, False, PLAIN)
 
 
 def test_the_whole_body_is_that_of_kinematics(who: Character, thrown: tuple):
@@ -96,8 +98,7 @@ def test_take_off_leads_up_to_the_flight(who: Character, thrown: tuple):
     plain = _motion(who, np.concatenate((ground, thrown[0])))
     made = flight.ballistic(who, plain)
     states = [flight.whole_body(who.model, q, v) for q, v in zip(made.qpos, made.qvel, strict=True)]
-    dt, wanted = plain.seconds / 44, states[20].angular
-    count = round(0.1 / dt)
+    wanted, count = states[20].angular, 6  # frames in 0.1 s
     shares = [s.angular[1] / wanted[1] for s in states[20 - count : 20]]
     np.testing.assert_allclose(shares[:-1], np.arange(1, count) / (count + 1), atol=0.02)
     level = [s.velocity[0] / states[20].velocity[0] for s in states[20 - count : 20]]
@@ -113,5 +114,20 @@ def test_on_the_floor_nothing_changes(who: Character):
 
 def test_flights_are_runs_of_frames_in_the_air():
     lowest = np.array([0.1, 0.1, 0.1, 0.0, 0.3, 0.3, 0.019, 0.03, 0.03, 0.03, 0.03])
-    assert [list(found) for found in flight.flights(lowest)] == [[0, 1, 2], [7, 8, 9, 10]]
-    assert list(flight.flights(np.zeros(5))) == []
+    still = np.zeros((11, 3))  # for 1/60 s nobody is thrown by 5 cm
+    found = [list(of) for of in flight.flights(lowest, still, DT, GRAVITY)]
+    assert found == [[0, 1, 2], [7, 8, 9, 10]]
+    assert list(flight.flights(np.zeros(5), still[:5], DT, GRAVITY)) == []
+
+
+def test_who_pushes_off_with_floating_feet_is_not_thrown_yet():
+    """Ten frames in which the centre of mass rises by 20 cm, then twenty of flight."""
+    flying = DT * np.arange(20)
+    rise = 0.2 * (np.arange(10) / 10) ** 2
+    height = np.concatenate((rise, 0.2 + 2.4 * flying - 0.5 * 9.81 * flying**2))
+    centers = np.stack((0.0 * height, 0.0 * height, height), 1)
+    (found,) = flight.flights(np.full(30, 0.03), centers, DT, GRAVITY)
+    assert 5 <= found.start <= 11 and found.stop == 30
+    velocity, above = flight.thrown(centers[10:], DT, GRAVITY)
+    np.testing.assert_allclose(velocity, [0.0, 0.0, 2.4], atol=1e-9)
+    np.testing.assert_allclose(above, 0.0, atol=1e-9)

@@ -22,6 +22,7 @@ from jaxskills.retarget import posed
 _ROOT = 1  # MuJoCo's body that the character's tree begins with, on a free joint
 _AIRBORNE = 0.02  # m over the floor, of the lowest point; clips are off by that much
 _SHORTEST = 3  # frames
+_PARABOLA = 0.05  # m, so far the centre of mass may be from one, or it is not thrown
 _TAKE_OFF = 0.1  # s before a flight, in which its momentum is gathered
 _LEVEL = np.array([1.0, 1.0, 0.0])
 
@@ -46,34 +47,59 @@ def ballistic(character: Character, motion: Motion) -> Motion:
     Upwards it stays the clip's, as feet on the floor give it within a frame or two.
     """
     model, qpos, qvel = character.model, np.array(motion.qpos, float), np.array(motion.qvel, float)
-    dt = motion.seconds / (len(qpos) - 1)
-    gravity = np.array(model.opt.gravity)
-    for frames in flights(posed.look(model, qpos).lowest):
-        states = [whole_body(model, qpos[i], qvel[i]) for i in frames]
-        time = dt * np.arange(len(frames))
-        fallen = np.array([s.center for s in states]) - 0.5 * gravity * time[:, None] ** 2
-        begin = np.polyfit(time, fallen, 1)[0]
-        weights = [np.linalg.inv(s.inertia) for s in states]
-        turned = sum(w @ s.angular for w, s in zip(weights, states, strict=True))
+    dt, gravity = motion.seconds / (len(qpos) - 1), model.opt.gravity
+    states = [whole_body(model, *row) for row in zip(qpos, qvel, strict=True)]
+    centers = np.array([state.center for state in states])
+    for frames in flights(posed.look(model, qpos).lowest, centers, dt, gravity):
+        begin = thrown(centers[frames], dt, gravity)[0]
+        weights = [np.linalg.inv(states[i].inertia) for i in frames]
+        turned = sum(w @ states[i].angular for w, i in zip(weights, frames, strict=True))
         angular = np.linalg.solve(np.sum(weights, axis=0), turned)
-        for i, t, state in zip(frames, time, states, strict=True):
-            qvel[i, :6] += root_change(state, begin + gravity * t, angular)
+        for i in frames:
+            velocity = begin + gravity * dt * (i - frames.start)
+            qvel[i, :6] += root_change(states[i], velocity, angular)
         before = range(max(frames.start - round(_TAKE_OFF / dt), 0), frames.start)
         for i, share in zip(before, np.linspace(0.0, 1.0, len(before) + 2)[1:-1], strict=True):
-            state = whole_body(model, qpos[i], qvel[i])
-            velocity = state.velocity + share * _LEVEL * (begin - state.velocity)
-            more = share * (angular - state.angular)
-            qvel[i, :6] += root_change(state, velocity, state.angular + more)
+            velocity = states[i].velocity + share * _LEVEL * (begin - states[i].velocity)
+            more = share * (angular - states[i].angular)
+            qvel[i, :6] += root_change(states[i], velocity, states[i].angular + more)
     return dataclasses.replace(motion, qvel=jnp.asarray(qvel, jnp.float32))
 
 
-def flights(lowest: np.ndarray) -> Iterator[range]:
-    """Yields the runs of frames in which the lowest point `[F]` (m) is above the floor."""
+def flights(
+    lowest: np.ndarray, centers: np.ndarray, dt: float, gravity: np.ndarray
+) -> Iterator[range]:
+    """Yields the runs of frames in which the body is thrown.
+
+    Nothing is near the floor there, and the centre of mass follows a parabola. Where it does not,
+    as feet float over the floor while they push off, frames are left out at either end.
+
+    Args:
+      lowest: `[F]` m, the lowest point over the floor.
+      centers: `[F, 3]` m, the centre of mass.
+      dt: s, from frame to frame.
+      gravity: `[3]` m/s^2.
+    """
     up = np.concatenate(([False], lowest > _AIRBORNE, [False]))
     begins, ends = np.flatnonzero(~up[:-1] & up[1:]), np.flatnonzero(up[:-1] & ~up[1:])
     for begin, end in zip(begins, ends, strict=True):
+        off = lambda a, b: np.abs(thrown(centers[a:b], dt, gravity)[1]).max()  # noqa: E731
+        while end - begin >= _SHORTEST and off(begin, end) > _PARABOLA:
+            first = off(begin + 1, end) <= off(begin, end - 1)
+            begin, end = begin + first, end - (not first)
         if end - begin >= _SHORTEST:
             yield range(begin, end)
+
+
+def thrown(centers: np.ndarray, dt: float, gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the velocity `[3]` at the first of `centers [F, 3]` of the parabola that fits best.
+
+    Also how far they are above it, `[F]` m. `dt` and `gravity` are those of `flights`.
+    """
+    time = dt * np.arange(len(centers))
+    straight = centers - 0.5 * time[:, None] ** 2 * gravity
+    velocity, begin = np.polyfit(time, straight, 1)
+    return velocity, (straight - begin - time[:, None] * velocity)[:, 2]
 
 
 def root_change(state: State, velocity: np.ndarray, angular: np.ndarray) -> np.ndarray:
