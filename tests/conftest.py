@@ -7,9 +7,12 @@ from pathlib import Path
 
 import jax
 import pytest
+import tiny
 
 from jaxskills import physics
+from jaxskills.character import Character
 from jaxskills.errors import UserError
+from jaxskills.motion import Motion
 from jaxskills.paths import deepmimic_dirs
 
 # Tests compile more than they run: all take 14 minutes instead of 21 where LLVM does not optimise.
@@ -53,3 +56,22 @@ def deepmimic() -> Path:
         return deepmimic_dirs()[-1]
     except UserError as missing:
         pytest.skip(str(missing))
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder of compiled code, also quickly compiled, for who compiles the same again."""
+    with tiny.compilation_cache(tmp_path_factory.mktemp("cache")) as folder:
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
+    """The walker of `tiny`, if a module has no other character."""
+    return tiny.load_character(tmp_path_factory.mktemp("character"))
+
+
+@pytest.fixture(scope="module")
+def walk(who: Character) -> Motion:
+    """Its walk, a loop."""
+    return tiny.make_motion(who, tiny.walking(), loop=True)

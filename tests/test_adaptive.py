@@ -4,7 +4,6 @@
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +27,7 @@ SLOW = AdaptiveBoundsConfig(enabled=True, target=2.0, rate=0.1, memory=0.0, low=
 LEARN = AdaptiveBoundsConfig(enabled=True, target=0.3, start=1.5, rate=0.05, memory=0.5)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cached(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with tiny.compilation_cache(tmp_path_factory.mktemp("cache")):
-        yield
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 @pytest.fixture(scope="module")

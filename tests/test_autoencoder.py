@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny
 
 from jaxskills import character as character_lib
 from jaxskills.character import Character
@@ -116,11 +115,6 @@ def test_the_error_is_of_the_inner_frames(model: Autoencoder, data: jax.Array):
     wrong = autoencoder.decode(model, autoencoder.encode(model, data)) - data
     expected = np.sqrt(np.mean(np.asarray(wrong)[:, 4:8] ** 2, (0, 1)))
     np.testing.assert_allclose(autoencoder.error(model, data), expected, rtol=1e-5)
-
-
-@pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
 
 
 def test_a_file_holds_it_all(model: Autoencoder, who: Character, tmp_path: Path):

@@ -23,11 +23,6 @@ NAMES = (
 
 
 @pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
 def errors(who: Character) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Returns (pose, reference pose) -> the error of each channel."""
     tree, params = kinematics.tree(who.model), kinematics.body_params(who.model)

@@ -12,12 +12,6 @@ from jaxskills.env import bounds, bounds_file
 from jaxskills.env.bounds import BoundsConfig
 from jaxskills.errors import UserError
 
-
-@pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
 CHANGED = BoundsConfig(
     com=(0.1, 0.25, float("inf")),
     root=1.0,

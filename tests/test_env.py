@@ -40,16 +40,6 @@ def _running(env: Environment) -> Running:
 
 
 @pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
-def walk(who: Character) -> Motion:
-    return tiny.make_motion(who, tiny.walking(), True)
-
-
-@pytest.fixture(scope="module")
 def walker(who: Character, walk: Motion) -> Running:
     """The walk on the real engine."""
     return _running(tiny.make_env(who, walk))

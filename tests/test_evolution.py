@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny
 
 from jaxskills import motion as motion_lib
 from jaxskills.character import Character
@@ -16,16 +15,6 @@ from jaxskills.motion import Motion
 
 SEGMENTS = 5
 CONFIG = EvolutionConfig(elites=8)
-
-
-@pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
-def walk(who: Character) -> Motion:
-    return tiny.make_motion(who, tiny.walking(), loop=True)
 
 
 @pytest.fixture(scope="module")

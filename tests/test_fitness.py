@@ -31,11 +31,6 @@ FACTORS = ("pose", "velocity", "contact", "drag")
 
 
 @pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
 def bow(who: Character) -> Motion:
     """Feet planted, the spine bends to and fro while the walker lifts itself off at the end."""
     qpos = tiny.standing(31)

@@ -20,11 +20,6 @@ PLAIN = MotionConfig(smooth_velocity=0.0)
 
 
 @pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
 def thrown(who: Character) -> tuple[np.ndarray, np.ndarray]:
     """`[F, nq]`, `[F, nv]` of the limp walker, which tumbles with swinging legs above the floor."""
     model = copy.copy(who.model)

@@ -27,11 +27,6 @@ ALPHA = 0.4
 
 
 @pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
 def encode(who: Character) -> Callable[[jax.Array], jax.Array]:
     """Random filters over time."""
     size = 3 * len(who.body_names) + 4

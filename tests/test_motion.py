@@ -19,11 +19,6 @@ PLAIN = MotionConfig(smooth_velocity=0.0)
 TURNING = MotionConfig(turn_with_cycle=True)
 
 
-@pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
 def _times(qpos: np.ndarray, seconds: float = 1.0) -> np.ndarray:
     return np.linspace(0.0, seconds, len(qpos))
 

@@ -23,11 +23,6 @@ _HEIGHT, _COM = 3, 4 + 9 + 24 + 12 + 12 + 9
 
 
 @pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
 def look(who: Character) -> Callable[..., np.ndarray]:
     """Returns (state, reference state, axis, phase) -> observation, in a cycle of 30 frames."""
     tree, params = kinematics.tree(who.model), kinematics.body_params(who.model)

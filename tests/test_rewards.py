@@ -6,16 +6,10 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tiny
 
 from jaxskills.character import Character
 from jaxskills.env import rewards
 from jaxskills.kinematics import Bodies
-
-
-@pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
 
 
 def _bodies(com_vel) -> Bodies:

@@ -29,11 +29,6 @@ def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
 
 
 @pytest.fixture(scope="module")
-def walk(who: Character) -> Motion:
-    return tiny.make_motion(who, tiny.walking(), True)
-
-
-@pytest.fixture(scope="module")
 def made(who: Character, walk: Motion) -> task.Task:
     return task.make(SPEC, who, walk)
 

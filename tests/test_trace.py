@@ -20,16 +20,6 @@ ROOT, HEADING = slice(0, 6), 5  # displacement indices
 
 
 @pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
-def walk(who: Character) -> Motion:
-    return tiny.make_motion(who, tiny.walking(), loop=True)
-
-
-@pytest.fixture(scope="module")
 def once(who: Character) -> Motion:
     return tiny.make_motion(who, tiny.walking(), loop=False)
 

@@ -24,11 +24,6 @@ EFFECTORS = (1, 2, 3)
 SAME = (jnp.float32(1.3), jnp.float32(1.3))
 
 
-@pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
 def _bodies(pos=((0.0, 0.0, 0.0),) * 4, com=(0.0, 0.0, 0.0)) -> Bodies:
     none = jnp.zeros((4, 3))
     here = jnp.array(pos, jnp.float32) + 2.0

@@ -5,7 +5,7 @@ import dataclasses
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -27,13 +27,6 @@ from jaxskills.learn.ppo import PPOConfig
 from jaxskills.trainer import TrainConfig, Trainer, TrainState
 
 Update = Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The fresh process need not compile what this one did."""
-    with tiny.compilation_cache(tmp_path_factory.mktemp("cache")) as folder:
-        yield folder
 
 
 @pytest.fixture(scope="module")

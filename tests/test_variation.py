@@ -22,16 +22,6 @@ PLAIN = MotionConfig(smooth_velocity=0.0)
 
 
 @pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
-def walk(who: Character) -> Motion:
-    return tiny.make_motion(who, tiny.walking(), loop=True)
-
-
-@pytest.fixture(scope="module")
 def once(who: Character) -> Motion:
     """The walk, performed once, with the velocities of its poses."""
     return motion_lib.from_qpos(who.model, tiny.walking(), np.linspace(0, 1, 31), False, PLAIN)

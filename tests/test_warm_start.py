@@ -2,7 +2,6 @@
 """A training begins with the networks of another run."""
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -15,11 +14,7 @@ from jaxskills.errors import UserError
 from jaxskills.learn.networks import NetworkConfig
 from jaxskills.trainer import TrainConfig
 
-
-@pytest.fixture(scope="module", autouse=True)
-def cached(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with tiny.compilation_cache(tmp_path_factory.mktemp("cache")):
-        yield
+pytestmark = pytest.mark.usefixtures("cache")
 
 
 @pytest.fixture(scope="module")

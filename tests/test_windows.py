@@ -10,11 +10,6 @@ from jaxskills.learn import windows
 
 
 @pytest.fixture(scope="module")
-def who(tmp_path_factory: pytest.TempPathFactory) -> Character:
-    return tiny.load_character(tmp_path_factory.mktemp("character"))
-
-
-@pytest.fixture(scope="module")
 def found(who: Character) -> list[np.ndarray]:
     """Windows of 12 frames: of a walk, of the same turned, and of one without loop."""
     turned = tiny.walking()
