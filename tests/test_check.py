@@ -280,3 +280,11 @@ def test_real_clips_with_planted_faults(humanoid: Character, deepmimic: Path, na
     for fault in ("right knee flipped", "left and right", "centimetres", "z up taken for y up"):
         plant, codes, _ = PLANTED[fault]
         assert faults(check.check(humanoid, plant(sound))) == codes, fault
+
+
+def test_turning_that_changes_in_the_air_is_named(humanoid: Character, deepmimic: Path):
+    flip = check.check(humanoid, clip.load("backflip"))
+    assert re.search(r"up to 7\.\d rad/s off .* at 6\d% of the clip", text(flip, "flight"))
+    jump = check.check(humanoid, clip.load("jump"))
+    assert "flight" not in [finding.code for finding in jump.findings]
+    assert 0.5 < jump.numbers["flight_turning"] < 2.0

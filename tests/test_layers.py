@@ -19,8 +19,8 @@ rotation pose
 clip.data clip.roles clip.deepmimic clip.bvh clip.keyframes clip
 character
 retarget.hinges retarget.posed retarget.mapping retarget
-check.measures check.repairs check.faults check
 kinematics terrain ground motion flight objects levels variation trace
+check.measures check.repairs check.faults check
 
 physics.quiet physics.ffi physics.base physics.cpu physics.box_floor physics.explicit
 physics.mjx physics.servo physics

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxskills import retarget
+from jaxskills import flight, motion, retarget
 from jaxskills.character import Character
 from jaxskills.check import faults, measures
 from jaxskills.check.faults import SEVERITIES, Finding
@@ -21,6 +21,7 @@ _CLEAR = 0.03  # m above or below the floor that nobody sees
 _FAST = 25.0  # rad/s, joints of real clips spike to 30 in noise, people reach about 20
 _TRAVEL = 0.3  # m, less is standing
 _LOOP_GAP = 45.0  # degrees
+_TUMBLE = 4.0  # rad/s that the body's turning in flight may be off; the clips of SB: backflip 7, 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,6 +83,7 @@ def check(character: Character, clip: Clip, mapping: Mapping | None = None) -> R
     found += _matching(character, mapping, unmatched, undriven, moved)
     found += _timing(clip, numbers) + _loop(clip, numbers) + _floor(view, moved.lift, numbers)
     found += _speeds(clip, numbers) + _limits(character, moved, numbers)
+    found += _flight(character, clip, moved, numbers)
     found += _heading(clip, moved, numbers) + _sound(character, clip, mapping, found)
     found += [Finding("info", "loader", note) for note in clip.notes]
     return Report(
@@ -229,6 +231,24 @@ def _speeds(clip: Clip, numbers: dict[str, float]) -> list[Finding]:
         text = f"the root moves at {root.max():.3g} m/s at frame {int(np.argmax(root))}: it jumps"
         found.append(Finding("warning", "root_jump", text))
     return found
+
+
+def _flight(
+    character: Character, clip: Clip, moved: retarget.Transfer, numbers: dict[str, float]
+) -> list[Finding]:
+    """Angular momentum that changes in the air, told by the turning that is too much or lacking."""
+    plain = motion.from_qpos(character.model, moved.qpos, clip.times, clip.loop)
+    change = (flight.ballistic(character, plain).qvel - plain.qvel)[:, 3:6]
+    off = np.linalg.norm(np.asarray(change), axis=1)
+    numbers["flight_turning"] = float(off.max())
+    if off.max() < _TUMBLE:
+        return []
+    share = float(off.argmax()) / (len(off) - 1)
+    text = (
+        f"in the air the body's turning is up to {off.max():.1f} rad/s off what keeps its angular"
+        f" momentum, at {share:.0%} of the clip: learn it with --motion.ballistic"
+    )
+    return [Finding("warning", "flight", text)]
 
 
 def _limits(
