@@ -51,6 +51,20 @@ def test_a_skill_that_stands_on_coarse_physics_alone_is_not_learnt(
     assert judged.learnt
 
 
+@pytest.mark.parametrize("lucky", [1, 2, 3])
+def test_a_skill_that_passes_once_was_lucky(
+    lucky: int, skill: Trainer, monkeypatch: pytest.MonkeyPatch
+):
+    """Both rates are asked twice; whoever passes `lucky` of these four and then fails goes on."""
+    rates = iter([1.0] * lucky + [0.95] + [1.0] * 4)
+    monkeypatch.setattr(SkillJudge, "_evaluate", lambda *_: ({"success_rate": next(rates)}, 0.0))
+    judged = judge.make(skill)
+    found = judged(_STATE, _survived(5.0))
+    assert 0.95 in found.values() and not judged.learnt
+    assert judged(_STATE, _survived(5.0)) == {"success_rate": 1.0, "fine_success_rate": 1.0}
+    assert judged.learnt and next(rates, None) is None
+
+
 def test_evaluations_wait_unless_survival_has_doubled(
     skill: Trainer, monkeypatch: pytest.MonkeyPatch
 ):

@@ -24,8 +24,10 @@ _EARLY_SHARE = 0.05
 _EVALUATION_SHARE = 0.2
 _FINE_SHARE = 0.5
 # Of 64 episodes, to stop. A skill is to stand 20 s (SB Table 1) in 95 %, but who stops at that rate
-# stops by luck: in 64 other episodes it comes out lower.
+# stops by luck: in 64 other episodes it comes out lower. One that stands in 95 % passes at 98 % in
+# one of six evaluations, and there are many: so it has to pass twice in a row, with other starts.
 SURE_RATE = 0.98
+_ROUNDS = 2
 _PROMISING_SECONDS = 2.0  # of survival while exploring, before an evaluation is worth its time
 # A family is learnt when ER (FS Table 1) is 1, rounded, and of 50 new task parameters so many are
 # got through, and done so closely in the mean: as a share of what was asked, or of the range.
@@ -38,7 +40,8 @@ class SkillJudge:
     """Evaluates a skill.
 
     It counts as learnt when it passes as it was trained and then, with other starts, on a finer
-    engine: a controller that lives off the errors of large time steps does not pass.
+    engine, and both once more: a controller that lives off the errors of large time steps does not
+    pass, nor one that was lucky.
     """
 
     def __init__(self, made: Trainer):
@@ -56,13 +59,19 @@ class SkillJudge:
         if early or survival < _PROMISING_SECONDS or not enabled:
             return {}
         self._tried = survival
-        found, spent = self._evaluate(state, None)
-        pause = spent / (_EARLY_SHARE if found["success_rate"] < 0.5 else _EVALUATION_SHARE)
-        if found["success_rate"] >= SURE_RATE:
+        found, pause, passed = {}, 0.0, 0
+        while not self.learnt:
+            found, spent = self._evaluate(state, None)
+            pause += spent / (_EARLY_SHARE if found["success_rate"] < 0.5 else _EVALUATION_SHARE)
+            if found["success_rate"] < SURE_RATE:
+                break
             fine, spent = self._evaluate(state, evaluate.FINE_SUBSTEPS)
             found["fine_success_rate"] = fine["success_rate"]
-            self.learnt = fine["success_rate"] >= SURE_RATE
             pause += spent / _FINE_SHARE
+            if fine["success_rate"] < SURE_RATE:
+                break
+            passed += 1
+            self.learnt = passed == _ROUNDS
         self._due = time.monotonic() + pause
         names = ("success_rate", "fine_success_rate", "seconds_mean", "inside_seconds_mean")
         return {name: found[name] for name in names if name in found}
