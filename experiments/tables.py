@@ -114,11 +114,12 @@ def _style(record: dict[str, Any]) -> dict[str, str]:
 
 
 def _measured(record: dict[str, Any]) -> list[str]:
-    passed = [row for row in record["curve"] if row.get("success_rate", 0.0) >= _PASSED]
+    asked = [row for row in record["curve"] if "success_rate" in row]
+    passed = [row for row in asked if row["success_rate"] >= _PASSED]
     found = record["evaluate"]
     return [
         f"{record['samples'] / 1e6:.2f} M",
-        f"{passed[0]['samples'] / 1e6:.2f} M" if passed else "never",
+        f"{passed[0]['samples'] / 1e6:.2f} M" if passed else "never" if asked else "",
         f"{record['wall_s'] / 60:.0f}",
         f"{found['success_rate']:.0%} of {found['episodes']}" if found else "failed",
         f"{found['seconds_mean']:.1f} s" if found else "",

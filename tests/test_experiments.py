@@ -72,6 +72,7 @@ def test_a_comparison_table():
     cases = {
         "plain": RECORD | {"curve": curve[:1], "evaluate": measured},
         "like": RECORD | style | {"evaluate": measured, "gram_distances": {"happy_walk": 0.876}},
+        "unasked": RECORD | {"curve": [{"samples": 1e6}], "evaluate": found},
     }
     lines = script("tables").comparison(cases).splitlines()
     assert lines[0].endswith(
@@ -79,6 +80,7 @@ def test_a_comparison_table():
     )
     assert lines[2] == "| plain | 1.23 M | never | 2 | 98% of 64 | 19.5 s |  |  |  |"
     assert lines[3] == "| like | 1.23 M | 2.00 M | 2 | 98% of 64 | 19.5 s | 0.88 | 61.2 | 51.2 |"
+    assert lines[4] == "| unasked | 1.23 M |  | 2 | 98% of 64 | 19.5 s |  |  |  |"
 
 
 FAMILY = RECORD | {
