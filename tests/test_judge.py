@@ -13,7 +13,7 @@ from jaxskills import evaluate, families, judge, trainer
 from jaxskills.judge import FamilyJudge, SkillJudge
 from jaxskills.trainer import Trainer
 
-_STATE: Any = None  # nothing here looks at it
+_STATE: Any = SimpleNamespace(refinement=SimpleNamespace(fine=False))  # no more is looked at
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +35,9 @@ def _survived(seconds: float) -> dict[str, float]:
 def test_a_skill_that_stands_on_coarse_physics_alone_is_not_learnt(
     skill: Trainer, monkeypatch: pytest.MonkeyPatch
 ):
-    rates = {None: 1.0, evaluate.FINE_SUBSTEPS: 0.969}
+    rates = {skill.config.env.substeps: 1.0, evaluate.FINE_SUBSTEPS: 0.969}
 
-    def found(self: Any, state: Any, substeps: int | None) -> tuple[dict[str, float], float]:
+    def found(self: Any, state: Any, substeps: int) -> tuple[dict[str, float], float]:
         return {"success_rate": rates[substeps]}, 0.0
 
     monkeypatch.setattr(SkillJudge, "_evaluate", found)
@@ -63,6 +63,19 @@ def test_a_skill_that_passes_once_was_lucky(
     assert 0.95 in found.values() and not judged.learnt
     assert judged(_STATE, _survived(5.0)) == {"success_rate": 1.0, "fine_success_rate": 1.0}
     assert judged.learnt and next(rates, None) is None
+
+
+def test_a_refined_skill_is_asked_at_its_own_rate(skill: Trainer, monkeypatch: pytest.MonkeyPatch):
+    rates = []
+
+    def found(self: Any, state: Any, substeps: int) -> tuple[dict[str, float], float]:
+        rates.append(substeps)
+        return {"success_rate": 1.0}, 0.0
+
+    monkeypatch.setattr(SkillJudge, "_evaluate", found)
+    refined: Any = SimpleNamespace(refinement=SimpleNamespace(fine=True))
+    judge.make(skill)(refined, _survived(5.0))
+    assert rates == [2 * skill.config.env.substeps, evaluate.FINE_SUBSTEPS] * 2
 
 
 def test_evaluations_wait_unless_survival_has_doubled(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tiny
 
-from jaxskills import checkpoint, train, trainer
+from jaxskills import checkpoint, runs, train, trainer
 from jaxskills.errors import UserError
 from jaxskills.explore import refine
 from jaxskills.explore.refine import RefineConfig
@@ -49,8 +49,10 @@ def test_a_run_turns_fine_and_resumes_fine(tmp_path: Path):
     """Cut in two after it has turned fine, it ends with the same bits as in one go."""
     config = tiny.train_config(tmp_path, refine=RefineConfig(survival=0.2, memory=0.5), samples=320)
     quiet = lambda metrics: None  # noqa: E731
-    _, whole, _ = train.train(config, tmp_path / "whole", quiet)
+    made, whole, _ = train.train(config, tmp_path / "whole", quiet)
     assert bool(whole.refinement.fine)
+    for shown in (made, runs.open_run(tmp_path / "whole")[0]):  # what is evaluated and filmed
+        assert shown.config.env.substeps == 2 * config.env.substeps
     rows = (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()
     assert json.loads(rows[-1])["fine"]
     half = dataclasses.replace(config, samples=224)

@@ -47,7 +47,7 @@ class SkillJudge:
     def __init__(self, made: Trainer):
         self.learnt = False
         self._made = made
-        self._compiled: dict[int | None, Any] = {}  # by substeps
+        self._compiled: dict[int, Any] = {}  # by substeps
         self._seed = 0
         self._due = 0.0
         self._tried = 0.0  # survival at the last evaluation
@@ -61,7 +61,7 @@ class SkillJudge:
         self._tried = survival
         found, pause, passed = {}, 0.0, 0
         while not self.learnt:
-            found, spent = self._evaluate(state, None)
+            found, spent = self._evaluate(state, self._rate(state))
             pause += spent / (_EARLY_SHARE if found["success_rate"] < 0.5 else _EVALUATION_SHARE)
             if found["success_rate"] < SURE_RATE:
                 break
@@ -76,7 +76,12 @@ class SkillJudge:
         names = ("success_rate", "fine_success_rate", "seconds_mean", "inside_seconds_mean")
         return {name: found[name] for name in names if name in found}
 
-    def _evaluate(self, state: TrainState, substeps: int | None) -> tuple[dict[str, float], float]:
+    def _rate(self, state: TrainState) -> int:
+        """Returns the physics steps of a control step that the state is learnt with."""
+        config, fine = self._made.config, bool(state.refinement.fine)
+        return config.env.substeps * (config.refine.factor if fine else 1)
+
+    def _evaluate(self, state: TrainState, substeps: int) -> tuple[dict[str, float], float]:
         """Returns the figures and the seconds they took; compiling must not put off the next."""
         self._seed += 1
         key = jax.random.key(self._seed)

@@ -58,9 +58,8 @@ def train(
         state = checkpoint.restore(run, made)
         history = _rewind(run, int(state.samples))
         if history and history[-1].get("learnt") and config == checkpoint.read_config(run):
-            return made, state, history[-1] | {"why": "learnt"}
-        now = trainer.refined(made) if state.refinement.fine else made
-        update = jit(now.update, donate=True)
+            return trainer.as_fine(made, state), state, history[-1] | {"why": "learnt"}
+        update = jit(trainer.as_fine(made, state).update, donate=True)
     else:
         taught = None if config.init_from is None else warm_start.read(made, config.init_from)
         _claim(run)
@@ -70,7 +69,7 @@ def train(
     checkpoint.write_config(run, config)
     with _stop_signal() as stopped:
         state, last = _loop(made, update, run, state, history, begin, report, stopped)
-    return made, state, last
+    return trainer.as_fine(made, state), state, last
 
 
 def _begin(made: Trainer) -> tuple[TrainState, Callable[..., Any]]:

@@ -276,6 +276,11 @@ def refined(made: Trainer) -> Trainer:
     return make(dataclasses.replace(made.config, env=finer), *scene)
 
 
+def as_fine(made: Trainer, state: TrainState) -> Trainer:
+    """Returns the trainer with physics steps as fine as those that the state was learnt with."""
+    return refined(made) if made.task is None and bool(state.refinement.fine) else made
+
+
 def to_batch(
     config: ppo_lib.PPOConfig,
     nets: networks_lib.Networks,
