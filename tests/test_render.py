@@ -414,7 +414,8 @@ def test_each_library_draws_the_same(walker, tmp_path, library):
     environment.pop("PYOPENGL_PLATFORM", None)
     command = [sys.executable, "-c", _OTHER, walker.source, str(tmp_path / "picture.npy")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if "does not work here" in done.stderr:
+    # Where the library is missing, `import mujoco` itself may fail.
+    if "does not work here" in done.stderr or "has no attribute 'glGetError'" in done.stderr:
         pytest.skip(f"no {library} on this machine")
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, library, "")
     image = np.load(tmp_path / "picture.npy").astype(int)
