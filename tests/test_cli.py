@@ -5,6 +5,7 @@ import errno
 import hashlib
 import importlib.util
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -373,3 +374,15 @@ def test_as_a_module():
     )
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1 and "trian" in done.stderr
+
+
+def test_a_drawing_library_that_mujoco_does_not_know():
+    """MuJoCo refuses it as it is imported, whatever is to be done."""
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxskills", "clips", "list"],
+        env=os.environ | {"MUJOCO_GL": "crayon"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1 and "MUJOCO_GL='crayon'" in done.stderr

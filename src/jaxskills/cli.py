@@ -7,6 +7,7 @@ JAX and SciPy are imported only when a command needs them, so help and mistakes 
 import contextlib
 import dataclasses
 import errno
+import importlib
 import inspect
 import io
 import json
@@ -71,11 +72,11 @@ def _parse_train(typed: list[str]) -> tuple[arguments.Train, Any]:
 
     Which defaults those are depends on what is typed, so it is read twice.
     """
+    commands = _commands()
     from jaxskills import recipes
 
     named = typed and not typed[0].startswith("-")
     recipe = recipes.find(typed[0]) if named else None
-    commands = _commands()
     first = _read_train(typed, commands.settings(recipe))
     return first, _read_train(typed, commands.settings_of(first, first.config)).config
 
@@ -138,9 +139,22 @@ def _commands() -> ModuleType:
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
     # XLA's threads and a fork do not go together, but what forks here at once becomes ffmpeg.
     warnings.filterwarnings("ignore", message="os.fork", category=RuntimeWarning)
+    _check_mujoco()
     from jaxskills import commands
 
     return commands
+
+
+def _check_mujoco() -> None:
+    """Raises a `UserError` if MuJoCo cannot be imported for its choice of a drawing library."""
+    asked = os.environ.get("MUJOCO_GL")
+    try:
+        importlib.import_module("mujoco")
+    except (AttributeError, ImportError, RuntimeError) as error:
+        if not asked:
+            raise
+        reason = f"MuJoCo does not work with MUJOCO_GL='{asked}' ({error})"
+        raise UserError(f"{reason}: unset it") from None
 
 
 @contextlib.contextmanager
