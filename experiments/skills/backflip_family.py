@@ -4,6 +4,7 @@
 from jaxskills.env import measure
 from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
+from jaxskills.motion import MotionConfig
 from jaxskills.recipes import Recipe
 from jaxskills.trainer import TrainConfig, for_family
 
@@ -33,5 +34,8 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=for_family(TrainConfig(env=EnvConfig(heading="lateral"))),
+    # Its turning in flight is not that of a thrown body: see the recipe of the backflip alone.
+    config=for_family(
+        TrainConfig(env=EnvConfig(heading="lateral"), motion=MotionConfig(ballistic=True))
+    ),
 )
