@@ -149,7 +149,9 @@ def comparisons() -> str:
         if cases:
             of_families = all(map(family_tables.is_family, cases.values()))
             made = family_tables.comparison(cases) if of_families else comparison(cases)
-            tables.append(f"**{name}**\n\n{made}")
+            drawn = RESULTS / name / "curves.png"
+            shown = f"\n\n![{name}]({drawn.relative_to(RESULTS.parent)})" if drawn.is_file() else ""
+            tables.append(f"**{name}**\n\n{made}{shown}")
     return "\n\n".join(tables) or "None yet."
 
 

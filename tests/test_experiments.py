@@ -138,6 +138,35 @@ def test_families_have_a_table_of_their_own(tmp_path: Path, monkeypatch: pytest.
     assert "90 % explored after" in tables.comparisons()
 
 
+def _curve(*seconds: float) -> list[dict[str, float]]:
+    rows = [{"samples": 1_000_000 * (i + 1), "survival_s": s} for i, s in enumerate(seconds)]
+    return [*rows[:-1], {**rows[-1], "success_rate": 0.97}]
+
+
+def test_curves_begin_where_the_training_before_has_ended():
+    """The first update is left out: hardly an episode has ended in it."""
+    plain = RECORD | {"samples": 3_000_000, "curve": _curve(9.0, 1.0, 2.0)}
+    styled = RECORD | {"samples": 3_000_000, "curve": _curve(9.0, 15.0, 40.0)}
+    cases = {"plain": plain, "energy_up": styled}
+    page = script("curves").comparison("cartwheel_styles", cases)
+    first, _, second, passed = (line.get_xydata() for line in page.axes[0].lines)
+    assert first[:, 0].tolist() == [2.0, 3.0] and second[:, 0].tolist() == [5.0, 6.0]
+    assert first[:, 1] == pytest.approx([2 ** (1 / 3), 2 ** (2 / 3)])  # means of three, of the logs
+    assert passed.tolist() == [[6.0, 20.0]]  # episodes end after 20 s
+
+
+def test_curves_of_a_folder(tmp_path: Path):
+    curves, record = script("curves"), RECORD | {"curve": _curve(1.0, 2.0, 4.0)}
+    (tmp_path / "walk-2.json").write_text(json.dumps(record))
+    (tmp_path / "feedforward").mkdir()
+    (tmp_path / "feedforward" / "with.json").write_text(json.dumps(record))
+    assert curves.draw(tmp_path) == [tmp_path / "curves.png"]  # one case is no comparison
+    (tmp_path / "feedforward" / "without.json").write_text(json.dumps(record))
+    drawn = curves.draw(tmp_path)
+    assert [path.parent.name for path in drawn] == [tmp_path.name, "feedforward"]
+    assert all(path.read_bytes()[:4] == b"\x89PNG" for path in drawn)
+
+
 def test_the_families_of_the_paper():
     """Every row of FS Table 1 has its most samples; a recipe that is there is a family."""
     paper, most = script("family_tables").PAPER, script("fs_table1").SAMPLES
