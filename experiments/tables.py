@@ -9,6 +9,7 @@ trainings -->`, or the name of another page below.
 
 import argparse
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -90,11 +91,11 @@ def comparison(cases: dict[str, dict[str, Any]]) -> str:
     """Returns the table of a comparison: one line for each label's record."""
     heads = ["case", "samples", "95 % first after", "minutes", "20 s without a fall", "mean time"]
     cells = [[label, *_measured(record)] for label, record in cases.items()]
-    columns = [_style(record) for record in cases.values()]
-    for head in {head: None for style in columns for head in style}:
+    columns = [_found(record) for record in cases.values()]
+    for head in {head: None for found in columns for head in found}:
         heads.append(head)
-        for row, style in zip(cells, columns, strict=True):
-            row.append(style.get(head, ""))
+        for row, found in zip(cells, columns, strict=True):
+            row.append(found.get(head, ""))
     lines = [heads, ["---"] * len(heads), *cells]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
@@ -102,10 +103,15 @@ def comparison(cases: dict[str, dict[str, Any]]) -> str:
 _MEASURES = (("energy_mean", "energy, J", 1.0), ("volume_mean", "hull volume, l", 1e3))
 
 
-def _style(record: dict[str, Any]) -> dict[str, str]:
-    """Returns the measures of style of a comparison of styles, by the heads of their columns."""
+def _found(record: dict[str, Any]) -> dict[str, str]:
+    """Returns how closely the reference is followed, and of a comparison of styles their measures.
+
+    By the heads of their columns, as far as they are known.
+    """
     found, distances = record["evaluate"] or {}, record.get("gram_distances") or {}
-    cells = {f"distance from {clip}": f"{d:.2f}" for clip, d in distances.items() if d is not None}
+    off = found.get("joint_error_mean")
+    cells = {"joints off": f"{math.degrees(off):.1f}°"} if off is not None else {}
+    cells |= {f"distance from {clip}": f"{d:.2f}" for clip, d in distances.items() if d is not None}
     if "--env.style.style" in record["command"] or "_style " in record["command"]:
         for name, head, scale in _MEASURES:
             if found.get(name) is not None:

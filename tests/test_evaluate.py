@@ -88,6 +88,27 @@ def test_a_walker_that_stands_stands(run: Callable[[], Trace]):
     assert found["episodes"] == 3
 
 
+def test_accuracy_by_hand(standing: trainer.Trainer):
+    """Three steps of two episodes: one falls at its second step, the other ends at its third."""
+    assert [name.endswith("_position") for name in standing.env.endings[:10]].index(True) == 7
+    row = [0.3, 0.0, 0.4, 0.2, 0.1, 0.4, 0.7, 9.0, 9.0, 9.0]  # CoM, root, joints, ends
+    errors = np.array([[row, row], [[np.nan] * 10, np.zeros(10)], [[7.0] * 10, [7.0] * 10]])
+    trace = dataclasses.replace(
+        _trace([[0, 1, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 0]]),
+        errors=errors,
+        over=np.array([[0, 0], [0, 0], [0, 1]], bool),
+    )
+    assert evaluate.accuracy(standing.character, trace) == pytest.approx(
+        {  # of three steps, the third of which is on the reference
+            "com_error_mean": 2 / 3 * 0.5,
+            "root_error_mean": 2 / 3 * 0.2,
+            "joint_error_mean": 2 / 3 * 0.4,
+        }
+    )
+    nothing = dataclasses.replace(trace, fallen=np.ones((3, 2), bool))
+    assert set(evaluate.accuracy(standing.character, nothing).values()) == {None}
+
+
 def test_an_evaluation_is_without_noise(run: Callable[[], Trace]):
     jax.tree.map(np.testing.assert_array_equal, run(), run())
 

@@ -70,17 +70,17 @@ def test_a_comparison_table():
     style = {"command": "jaxskills train run_style --samples 1", "curve": curve}
     measured = found | {"energy_mean": 61.23, "volume_mean": 0.0512}
     cases = {
-        "plain": RECORD | {"curve": curve[:1], "evaluate": measured},
+        "plain": RECORD | {"curve": curve[:1], "evaluate": measured | {"joint_error_mean": 0.1}},
         "like": RECORD | style | {"evaluate": measured, "gram_distances": {"happy_walk": 0.876}},
         "unasked": RECORD | {"curve": [{"samples": 1e6}], "evaluate": found},
     }
     lines = script("tables").comparison(cases).splitlines()
     assert lines[0].endswith(
-        "| mean time | distance from happy_walk | energy, J | hull volume, l |"
+        "| mean time | joints off | distance from happy_walk | energy, J | hull volume, l |"
     )
-    assert lines[2] == "| plain | 1.23 M | never | 2 | 98% of 64 | 19.5 s |  |  |  |"
-    assert lines[3] == "| like | 1.23 M | 2.00 M | 2 | 98% of 64 | 19.5 s | 0.88 | 61.2 | 51.2 |"
-    assert lines[4] == "| unasked | 1.23 M |  | 2 | 98% of 64 | 19.5 s |  |  |  |"
+    assert lines[2] == "| plain | 1.23 M | never | 2 | 98% of 64 | 19.5 s | 5.7° |  |  |  |"
+    assert lines[3] == "| like | 1.23 M | 2.00 M | 2 | 98% of 64 | 19.5 s |  | 0.88 | 61.2 | 51.2 |"
+    assert lines[4] == "| unasked | 1.23 M |  | 2 | 98% of 64 | 19.5 s |  |  |  |  |"
 
 
 FAMILY = RECORD | {

@@ -162,6 +162,7 @@ def evaluate(command: arguments.Evaluate) -> Answer:
     trace = playback.play(made, state, config)
     data = {
         **evaluate_lib.summary(trace),
+        **evaluate_lib.accuracy(made.character, trace),
         "samples": int(state.samples),
         **dataclasses.asdict(config),
         "substeps": config.substeps or made.config.env.substeps,

@@ -17,6 +17,7 @@ import numpy as np
 from flax import struct
 
 from jaxskills import trainer as trainer_lib
+from jaxskills.character import Character
 from jaxskills.env.core import Environment
 from jaxskills.errors import UserError
 from jaxskills.learn import normalize, rollout
@@ -142,6 +143,24 @@ def summary(trace: Trace) -> dict[str, float]:
         "inside_seconds_mean": float(_first(outside).mean() * CONTROL_DT),
         "episodes": fallen.shape[1],
     }
+
+
+def accuracy(character: Character, trace: Trace) -> dict[str, float | None]:
+    """Returns how closely the reference is followed: means over all steps before a fall.
+
+    `com_error_mean`: m between the centres of mass. `root_error_mean`: rad between the roots'
+    orientations. `joint_error_mean`: rad between a joint and the reference's, over all of them.
+    None where every episode fell at once.
+    """
+    gone = np.asarray(trace.fallen) | np.asarray(trace.over)
+    errors = np.asarray(trace.errors)[~np.logical_or.accumulate(gone, axis=0)]
+    joints = len(character.layout.own.joints) - 1  # the first is the root's
+    by_name = {
+        "com_error_mean": np.linalg.norm(errors[:, :3], axis=-1),
+        "root_error_mean": errors[:, 3],
+        "joint_error_mean": errors[:, 4 : 4 + joints],
+    }
+    return {name: float(x.mean()) if x.size else None for name, x in by_name.items()}
 
 
 def _first(mask: np.ndarray) -> np.ndarray:
