@@ -28,8 +28,8 @@ def skill(family: Trainer) -> Trainer:
     return trainer.make(dataclasses.replace(config, task="", env=env))
 
 
-def _survived(seconds: float) -> dict[str, float]:
-    return {"survival_s": seconds}
+def _survived(seconds: float, gone: float = 0.0) -> dict[str, float]:
+    return {"survival_s": seconds, "wall_s": gone}
 
 
 def test_a_skill_that_stands_on_coarse_physics_alone_is_not_learnt(
@@ -87,6 +87,25 @@ def test_evaluations_wait_unless_survival_has_doubled(
     times = (2.5, 2.5, 4.9, 5.0, 5.0, 9.9, 10.0)
     asked = [bool(judged(state, _survived(survival))) for survival in times]
     assert asked == [True, False, False, True, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("rate", "gone", "pause"),
+    [(0.4, 900.0, 120.0), (0.7, 900.0, 90.0), (0.7, 90.0, 30.0), (0.9, 900.0, 30.0)],
+)
+def test_evaluations_are_few_until_few_fall(
+    rate: float, gone: float, pause: float, skill: Trainer, monkeypatch: pytest.MonkeyPatch
+):
+    """Of 6 s each: a twentieth of the time, a tenth of that gone by apart, a fifth of the time."""
+    clock = SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(judge, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(SkillJudge, "_evaluate", lambda *_: ({"success_rate": rate}, 6.0))
+    judged = judge.make(skill)
+    assert judged(_STATE, _survived(5.0, gone))
+    clock.now += pause - 0.1
+    assert not judged(_STATE, _survived(5.0, gone))
+    clock.now += 0.2
+    assert judged(_STATE, _survived(5.0, gone))
 
 
 def _performs(monkeypatch: pytest.MonkeyPatch, off: float, falls: int) -> list[np.ndarray]:
