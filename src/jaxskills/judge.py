@@ -15,7 +15,7 @@ import numpy as np
 from jaxskills import evaluate, evaluate_family, perform
 from jaxskills.compilation import jit
 from jaxskills.evaluate_family import FamilyEvaluateConfig
-from jaxskills.trainer import Trainer, TrainState
+from jaxskills.trainer import Trainer, TrainState, fine_substeps
 
 # Evaluations' share of the time, at most. The fine one runs only near the end and costs four times
 # as much: at the same share it would put off the next one, and so the end, by minutes. While many
@@ -88,8 +88,8 @@ class SkillJudge:
 
     def _rate(self, state: TrainState) -> int:
         """Returns the physics steps of a control step that the state is learnt with."""
-        config, fine = self._made.config, bool(state.refinement.fine)
-        return config.env.substeps * (config.refine.factor if fine else 1)
+        config = self._made.config
+        return fine_substeps(config) if bool(state.refinement.fine) else config.env.substeps
 
     def _evaluate(self, state: TrainState, substeps: int) -> tuple[dict[str, float], float]:
         """Returns the figures and the seconds they took; compiling must not put off the next."""

@@ -270,15 +270,19 @@ def refined(made: Trainer) -> Trainer:
 
     Its `update` is another program, which takes and gives the same kind of state.
     """
-    env = made.config.env
-    finer = dataclasses.replace(env, substeps=env.substeps * made.config.refine.factor)
+    finer = dataclasses.replace(made.config.env, substeps=fine_substeps(made.config))
     scene = made.character.scenery, made.character.objects
     return make(dataclasses.replace(made.config, env=finer), *scene)
 
 
+def fine_substeps(config: TrainConfig) -> int:
+    """Returns the physics steps of a control step for states whose refinement is fine."""
+    return config.env.substeps * config.refine.factor
+
+
 def as_fine(made: Trainer, state: TrainState) -> Trainer:
     """Returns the trainer with physics steps as fine as those that the state was learnt with."""
-    return refined(made) if made.task is None and bool(state.refinement.fine) else made
+    return refined(made) if bool(state.refinement.fine) else made
 
 
 def to_batch(
