@@ -100,6 +100,10 @@ def comparison(cases: dict[str, dict[str, Any]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+_OFF = (
+    ("joint_error_mean", "joints off", math.degrees(1.0), "°"),
+    ("com_error_mean", "CoM off", 100.0, " cm"),
+)
 _MEASURES = (("energy_mean", "energy, J", 1.0), ("volume_mean", "hull volume, l", 1e3))
 
 
@@ -109,8 +113,10 @@ def _found(record: dict[str, Any]) -> dict[str, str]:
     By the heads of their columns, as far as they are known.
     """
     found, distances = record["evaluate"] or {}, record.get("gram_distances") or {}
-    off = found.get("joint_error_mean")
-    cells = {"joints off": f"{math.degrees(off):.1f}°"} if off is not None else {}
+    cells = {}
+    for name, head, scale, unit in _OFF:
+        if found.get(name) is not None:
+            cells[head] = f"{scale * found[name]:.1f}{unit}"
     cells |= {f"distance from {clip}": f"{d:.2f}" for clip, d in distances.items() if d is not None}
     if "--env.style.style" in record["command"] or "_style " in record["command"]:
         for name, head, scale in _MEASURES:
@@ -151,7 +157,8 @@ def comparisons() -> str:
     tables = []
     for name, labels in COMPARISONS.items():
         paths = {label: RESULTS / name / f"{label}.json" for label in labels}
-        cases = {k: json.loads(path.read_text()) for k, path in paths.items() if path.is_file()}
+        found = {k: json.loads(path.read_text()) for k, path in paths.items() if path.is_file()}
+        cases = {_linked(name, label): record for label, record in found.items()}
         if cases:
             of_families = all(map(family_tables.is_family, cases.values()))
             made = family_tables.comparison(cases) if of_families else comparison(cases)
@@ -159,6 +166,12 @@ def comparisons() -> str:
             shown = f"\n\n![{name}]({drawn.relative_to(RESULTS.parent)})" if drawn.is_file() else ""
             tables.append(f"**{name}**\n\n{made}{shown}")
     return "\n\n".join(tables) or "None yet."
+
+
+def _linked(name: str, label: str) -> str:
+    """Returns a case's label, with a link to its film strip if it has one."""
+    strip = RESULTS / name / f"{label}.png"
+    return f"[{label}]({strip.relative_to(RESULTS.parent)})" if strip.is_file() else label
 
 
 PAGES = {"trainings": trainings, "families": families, "comparisons": comparisons}

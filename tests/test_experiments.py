@@ -68,19 +68,20 @@ def test_a_comparison_table():
     curve = [{"samples": 1e6, "success_rate": 0.5}, {"samples": 2e6, "success_rate": 0.97}]
     found = {"success_rate": 0.984375, "episodes": 64, "seconds_mean": 19.5}
     style = {"command": "jaxskills train run_style --samples 1", "curve": curve}
+    off = {"joint_error_mean": 0.1, "com_error_mean": 0.0312}
     measured = found | {"energy_mean": 61.23, "volume_mean": 0.0512}
     cases = {
-        "plain": RECORD | {"curve": curve[:1], "evaluate": measured | {"joint_error_mean": 0.1}},
+        "plain": RECORD | {"curve": curve[:1], "evaluate": measured | off},
         "like": RECORD | style | {"evaluate": measured, "gram_distances": {"happy_walk": 0.876}},
         "unasked": RECORD | {"curve": [{"samples": 1e6}], "evaluate": found},
     }
     lines = script("tables").comparison(cases).splitlines()
-    assert lines[0].endswith(
-        "| mean time | joints off | distance from happy_walk | energy, J | hull volume, l |"
-    )
-    assert lines[2] == "| plain | 1.23 M | never | 2 | 98% of 64 | 19.5 s | 5.7° |  |  |  |"
-    assert lines[3] == "| like | 1.23 M | 2.00 M | 2 | 98% of 64 | 19.5 s |  | 0.88 | 61.2 | 51.2 |"
-    assert lines[4] == "| unasked | 1.23 M |  | 2 | 98% of 64 | 19.5 s |  |  |  |  |"
+    heads = "| joints off | CoM off | distance from happy_walk | energy, J | hull volume, l |"
+    assert lines[0].endswith(f"| mean time {heads}")
+    begin = "| 1.23 M |", "| 2 | 98% of 64 | 19.5 s |"
+    assert lines[2] == f"| plain {begin[0]} never {begin[1]} 5.7° | 3.1 cm |  |  |  |"
+    assert lines[3] == f"| like {begin[0]} 2.00 M {begin[1]}  |  | 0.88 | 61.2 | 51.2 |"
+    assert lines[4] == f"| unasked {begin[0]}  {begin[1]}  |  |  |  |  |"
 
 
 FAMILY = RECORD | {
