@@ -74,12 +74,14 @@ def table1(found: dict[str, list[dict[str, Any]]]) -> Figure:
     rows = -(-len(found) // _COLUMNS)
     page = Figure(figsize=(2.6 * _COLUMNS, 2.3 * rows), dpi=110, layout="constrained")
     panels = page.subplots(rows, _COLUMNS, squeeze=False, sharex=True, sharey=True).ravel()
-    for axes, (skill, seeds) in zip(panels, found.items(), strict=False):
+    for i, (axes, (skill, seeds)) in enumerate(zip(panels, found.items(), strict=False)):
         for record in seeds:
             survival(record, axes, BLUE)
         axes.axvline(PAPER[skill] / 1e6, color=GREY, lw=1, ls="--")
-        finish(axes, skill, "samples (millions)", "survival (s)")
-        axes.label_outer()
+        lowest = i + _COLUMNS >= len(found)
+        first = "survival (s)" if i % _COLUMNS == 0 else ""
+        finish(axes, skill, "samples (millions)" if lowest else "", first)
+        axes.tick_params(labelbottom=lowest)
     panels[0].set_xscale("log")
     panels[0].set_xlim(0.02, 60.0)
     panels[0].set_xticks((0.1, 1, 10), ("0.1", "1", "10"))
