@@ -9,7 +9,6 @@ training episode with noise leaves its bounds (or falls, if that is what ends it
 than what an evaluation finds.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from compare import COMPARISONS
 from family_tables import is_family
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tables import PAPER, RESULTS, records
+from tables import PAPER, PASSED, RESULTS, cases, records
 
 from jaxskills.plot.lines import column
 from jaxskills.plot.sheet import BLUE, CYCLE, GREY, finish
@@ -41,22 +40,22 @@ def survival(
     padded = np.pad(np.log(seconds), (width, width), mode="edge")
     level = np.exp(np.convolve(padded, np.full(2 * width + 1, 1 / (2 * width + 1)), "valid"))
     axes.plot(samples, np.minimum(level, _TICKS[-1]), color=color, lw=1.4, label=label)
-    passed = column(curve, "success_rate") >= 0.95
+    passed = column(curve, "success_rate") >= PASSED
     axes.plot(samples[passed], np.minimum(level, _TICKS[-1])[passed], "o", color=color, ms=3)
 
 
-def comparison(name: str, cases: dict[str, dict[str, Any]]) -> Figure:
+def comparison(name: str, by_label: dict[str, dict[str, Any]]) -> Figure:
     """Returns the curves of a comparison's cases: survival, or how much is explored."""
     page = Figure(figsize=(6.2, 3.0), dpi=110, layout="constrained")
     axes = page.subplots()
-    families = all(map(is_family, cases.values()))
-    for colour, (label, record) in zip(CYCLE, cases.items(), strict=False):
+    families = all(map(is_family, by_label.values()))
+    for colour, (label, record) in zip(CYCLE, by_label.items(), strict=False):
         if families:
             episodes = column(record["curve"], "episodes") / 1e6
             explored = column(record["curve"], "explored")
             axes.plot(episodes, explored, color=colour, lw=1.4, label=label)
         else:
-            earlier = cases.get(COMPARISONS[name][label].after.removeprefix(f"{name}/"))
+            earlier = by_label.get(COMPARISONS[name][label].after.removeprefix(f"{name}/"))
             survival(record, axes, colour, label, earlier["samples"] if earlier else 0)
     if families:
         finish(axes, "", "episodes (millions)", "explored share of the task space")
@@ -108,11 +107,10 @@ def draw(results: Path) -> list[Path]:
         if record["skill"] in PAPER:
             by_skill.setdefault(record["skill"], []).append(record)
     pages = {results / "curves.png": table1(by_skill)} if by_skill else {}
-    for name, labels in COMPARISONS.items():
-        paths = {label: results / name / f"{label}.json" for label in labels}
-        cases = {k: json.loads(path.read_text()) for k, path in paths.items() if path.is_file()}
-        if len(cases) > 1:
-            pages[results / name / "curves.png"] = comparison(name, cases)
+    for name in COMPARISONS:
+        found = cases(results, name)
+        if len(found) > 1:
+            pages[results / name / "curves.png"] = comparison(name, found)
     for path, page in pages.items():
         page.savefig(path)
     return list(pages)

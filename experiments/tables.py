@@ -30,7 +30,7 @@ PAPER = {  # samples, SB Table 1
     "run_jump": 11.02e6,
     "backflip": 41.20e6,
 }
-_PASSED = 0.95  # of evaluated episodes, to count as learnt
+PASSED = 0.95  # of evaluated episodes, to count as learnt
 
 _HEAD = (
     "| skill | seed | samples | paper's | minutes | cores | 20 s without a fall"
@@ -43,6 +43,12 @@ def records(folder: Path) -> list[dict[str, Any]]:
     """Returns the records of `reproduce.py`, by skill and seed."""
     found = [json.loads(path.read_text()) for path in folder.glob("*-*.json")]
     return sorted(found, key=lambda record: (record["skill"], record["seed"]))
+
+
+def cases(folder: Path, name: str) -> dict[str, dict[str, Any]]:
+    """Returns the records of a comparison that are there, by label."""
+    paths = {label: folder / name / f"{label}.json" for label in COMPARISONS[name]}
+    return {k: json.loads(path.read_text()) for k, path in paths.items() if path.is_file()}
 
 
 def row(record: dict[str, Any]) -> str:
@@ -87,11 +93,11 @@ def speed(physics: dict[str, Any], train: dict[str, Any], family: dict[str, Any]
     return "\n".join(["| speed | |", "|---|---|", *lines])
 
 
-def comparison(cases: dict[str, dict[str, Any]]) -> str:
+def comparison(by_label: dict[str, dict[str, Any]]) -> str:
     """Returns the table of a comparison: one line for each label's record."""
     heads = ["case", "samples", "95 % first after", "minutes", "20 s without a fall", "mean time"]
-    cells = [[label, *_measured(record)] for label, record in cases.items()]
-    columns = [_found(record) for record in cases.values()]
+    cells = [[label, *_measured(record)] for label, record in by_label.items()]
+    columns = [_found(record) for record in by_label.values()]
     for head in {head: None for found in columns for head in found}:
         heads.append(head)
         for row, found in zip(cells, columns, strict=True):
@@ -127,7 +133,7 @@ def _found(record: dict[str, Any]) -> dict[str, str]:
 
 def _measured(record: dict[str, Any]) -> list[str]:
     asked = [row for row in record["curve"] if "success_rate" in row]
-    passed = [row for row in asked if row["success_rate"] >= _PASSED]
+    passed = [row for row in asked if row["success_rate"] >= PASSED]
     found = record["evaluate"]
     return [
         f"{record['samples'] / 1e6:.2f} M",
@@ -155,13 +161,11 @@ def families() -> str:
 def comparisons() -> str:
     """Returns a table for each comparison of which there are results."""
     tables = []
-    for name, labels in COMPARISONS.items():
-        paths = {label: RESULTS / name / f"{label}.json" for label in labels}
-        found = {k: json.loads(path.read_text()) for k, path in paths.items() if path.is_file()}
-        cases = {_linked(name, label): record for label, record in found.items()}
-        if cases:
-            of_families = all(map(family_tables.is_family, cases.values()))
-            made = family_tables.comparison(cases) if of_families else comparison(cases)
+    for name in COMPARISONS:
+        found = {_linked(name, k): record for k, record in cases(RESULTS, name).items()}
+        if found:
+            of_families = all(map(family_tables.is_family, found.values()))
+            made = family_tables.comparison(found) if of_families else comparison(found)
             drawn = RESULTS / name / "curves.png"
             shown = f"\n\n![{name}]({drawn.relative_to(RESULTS.parent)})" if drawn.is_file() else ""
             tables.append(f"**{name}**\n\n{made}{shown}")
