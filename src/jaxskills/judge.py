@@ -24,7 +24,7 @@ from jaxskills.trainer import Trainer, TrainState, fine_substeps
 _EARLY_SHARE = 0.05
 _EVALUATION_SHARE = 0.2
 _FINE_SHARE = 0.5
-_MOST, _MANY = 0.5, 0.9  # of the episodes stand
+_EARLY_RATE, _LATE_RATE = 0.5, 0.9  # of the episodes stand: below it is early, from it on late
 _APART = 0.1
 # Of 64 episodes, to stop. A skill is to stand 20 s (SB Table 1) in 95 %, but who stops at that rate
 # stops by luck: in 64 other episodes it comes out lower. One that stands in 95 % passes at 98 % in
@@ -81,10 +81,10 @@ class SkillJudge:
 
     def _pause(self, rate: float, spent: float, gone: float) -> float:
         """Returns the s until the next evaluation, after one that took `spent`, `gone` in all."""
-        if rate < _MOST:
+        if rate < _EARLY_RATE:
             return spent / _EARLY_SHARE
         pause = spent / _EVALUATION_SHARE
-        return pause if rate >= _MANY else max(pause, _APART * gone)
+        return pause if rate >= _LATE_RATE else max(pause, _APART * gone)
 
     def _rate(self, state: TrainState) -> int:
         """Returns the physics steps of a control step that the state is learnt with."""
