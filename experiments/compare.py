@@ -40,6 +40,7 @@ def _of(text: str) -> tuple[str, ...]:
 _IMITATION = "--env.reward imitation --env.stop fall"
 _DEEPMIMIC = f"{_IMITATION} --starts.uniform 1 --env.no-feedforward"
 _TIGHT = "--bounds.com 0.15 0.15 0.1 --bounds.root 0.35 --bounds.joints 0.35"
+_SB = "--bounds.com 0.3 0.3 0.2 --bounds.root 0.7 --bounds.joints 0.7"
 _LOOSE = "--bounds.com 0.6 0.6 0.4 --bounds.root 1.4 --bounds.joints 1.4"
 
 _ADAPTIVE = "--adaptive-bounds.enabled"
@@ -111,6 +112,16 @@ def _curricula(skill: str, samples: int) -> dict[str, Case]:
     return {name: Case(skill, _of(f"{how} {method}")) for name, method in methods.items()}
 
 
+def _stops(skill: str, samples: int) -> dict[str, Case]:
+    """A family whose episodes end at the bounds of SB, at those of the authors of FS, and ours."""
+    how = f"--samples {samples}"
+    return {
+        "sb": Case(skill, _of(f"{how} --env.stop bounds {_SB} --bounds.end-effectors 0.5")),
+        "authors": Case(skill, _of(f"{how} --bounds.root 1.26")),
+        "default": Case(skill, _of(how)),
+    }
+
+
 def _switched(skill: str, samples: int, without: str, label: str, option: str) -> dict[str, Case]:
     """A skill or a family as it is, and with one option."""
     how = f"--samples {samples}"
@@ -153,7 +164,8 @@ COMPARISONS: dict[str, dict[str, Case]] = {
     "jump_ablation": _ablation("jump_gravity_family", 10_000_000),
     "dodge_curricula": _curricula("dodge_family", 4_000_000),
     "jump_curricula": _curricula("jump_gravity_family", 10_000_000),
-    "dodge_stop": _switched("dodge_family", 4_000_000, "bounds", "fall", "--env.stop fall"),
+    "dodge_stop": _stops("dodge_family", 2_000_000),
+    "spinkick_stop": _stops("spinkick_family", 2_000_000),
     "push_torque": _switched(
         "push_family", 4_000_000, "limited", "unlimited", "--env.no-torque-limits"
     ),

@@ -253,29 +253,54 @@ def test_points_are_spread_evenly(parameters: int):
         assert share == pytest.approx(np.prod(high - low), abs=0.015)
 
 
-def test_proxy_of_three_elites_by_hand():
+def test_mean_of_three_elites_by_hand():
     """Weights F exp(-d^2 / 0.0784) at 0.3, of elites at distances 0.1, 0.2 and 0.5."""
     found = _holding(SMALL, (0.2, 0.4), (0.5, 0.8), (0.8, 1.0))
     weights = np.array([0.4 * 0.88024, 0.8 * 0.60036, 1.0 * 0.04123])
     weights /= weights.sum()
     expected = [weights @ [0.4, 0.8, 1.0], weights @ [0.2, 0.5, 0.8]]
-    np.testing.assert_allclose(_proxy(found, jnp.array([0.3])), expected, rtol=1e-4)
+    found = _proxy(found, jnp.array([0.3]), 5, ridge=100.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
 def test_proxy_as_by_a_plain_loop():
+    """Weighted least squares with a ridge, solved as one stacked system."""
     found, random = _scattered(60, 2), np.random.default_rng(2)
     places = random.uniform(size=(4, 3, 2)).astype(np.float32)
     members = np.array(list(_members(found)))
 
-    def one(a: np.ndarray, k: int) -> np.ndarray:
+    def one(a: np.ndarray, k: int, ridge: float) -> np.ndarray:
         squared = np.sum((members[:, 1:] - a) ** 2, axis=1)
         nearest = np.argsort(squared)[:k]
-        weights = members[nearest, 0] * np.exp(-squared[nearest] / 0.28**2)
-        return weights @ members[nearest] / weights.sum()
+        near = members[nearest]
+        weights = near[:, 0] * np.exp(-squared[nearest] / 0.28**2)
+        weights /= weights.sum()
+        middle, mean = weights @ near[:, 1:], weights @ near
+        left = np.sqrt(weights)[:, None] * (near[:, 1:] - middle)
+        right = np.sqrt(weights)[:, None] * (near - mean)
+        left = np.concatenate((left, ridge * np.eye(2)))
+        right = np.concatenate((right, np.zeros((2, right.shape[1]))))
+        slope = np.linalg.lstsq(left, right)[0]
+        ahead = a - middle
+        return mean + ahead * min(1.0, 0.28 / np.linalg.norm(ahead)) @ slope
 
-    for k in (1, 5):
-        expected = [[one(a, k) for a in row] for row in places]
-        np.testing.assert_allclose(_proxy(found, places, k), expected, rtol=1e-4)
+    for k, ridge in ((1, 0.03), (5, 0.03), (5, 0.3), (8, 100.0)):
+        expected = [[one(a, k, ridge) for a in row] for row in places]
+        got = _proxy(found, places, k, ridge=ridge)
+        np.testing.assert_allclose(got, expected, rtol=2e-4, atol=1e-5)
+
+
+def test_proxy_goes_on_as_the_elites_change():
+    """Motions that are linear in the task: also at the rim, where a mean would lie inside."""
+    a = np.stack(np.meshgrid([0.3, 0.4, 0.5], [0.4, 0.5]), -1).reshape(-1, 2)
+    new = _episodes(a, np.full(len(a), 0.5))
+    x = 2.0 * a[:, :1] - 3.0 * a[:, 1:] + [[0.0, 1.0]]
+    linear = Elites(new.a, jnp.asarray(x, jnp.float32), new.fitness, new.valid)
+    beyond = jnp.array([[0.6, 0.45], [0.4, 0.45]])
+    wanted = 2.0 * beyond[:, :1] - 3.0 * beyond[:, 1:] + jnp.array([[0.0, 1.0]])
+    np.testing.assert_allclose(_proxy(linear, beyond, 6, ridge=1e-3), wanted, atol=2e-3)
+    mean = _proxy(linear, beyond, 6, ridge=100.0)
+    assert abs(mean[0, 0] - wanted[0, 0]) > 0.1 > 10 * abs(mean[1, 0] - wanted[1, 0])
 
 
 def test_proxy_at_an_elite_whose_neighbours_are_far():

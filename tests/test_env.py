@@ -81,6 +81,13 @@ def faller(who: Character) -> Running:
 
 
 @pytest.fixture(scope="module")
+def careful(who: Character) -> Running:
+    """A frozen stand in wide bounds, in which a fall ends an episode too."""
+    sizes = BoundsConfig((0.8, 0.8, 0.8), 4.0, np.inf, np.inf)
+    return _running(_frozen(who, tiny.standing(), True, EnvConfig(stop="either"), sizes))
+
+
+@pytest.fixture(scope="module")
 def roller(who: Character) -> Running:
     """A frozen stand in which every body may touch the ground."""
     config = EnvConfig(stop="fall", may_touch=("pelvis", "torso", "left_leg", "right_leg"))
@@ -266,6 +273,23 @@ def test_in_fall_mode_only_a_fall_ends_an_episode(
     assert bool(outcome.report.fallen) == fallen
     if fallen:
         assert faller.env.endings[int(outcome.report.ended_by)] == "fall"
+
+
+@pytest.mark.parametrize(
+    ("moved", "end"),
+    [
+        ({"d2": -0.1}, ""),
+        ({"d9": 2.0}, ""),
+        ({"d2": -0.46}, "fall"),  # the pelvis on the floor, inside the bounds
+        ({"d0": 1.0}, "com_x"),  # upright
+        ({"d0": 1.0, "d2": -0.46}, "com_x"),
+    ],
+)
+def test_bounds_and_falls_both_end_an_episode(
+    who: Character, careful: Running, moved: dict, end: str
+):
+    ended, _, by = _after(careful, _put(_displaced(who, **moved)))
+    assert (ended, by if ended else "") == (bool(end), end)
 
 
 @pytest.mark.parametrize(

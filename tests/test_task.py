@@ -151,7 +151,7 @@ def test_a_task_without_measures(who: Character, walk: Motion):
     known, rows = _play(who, made, [0.5], 1.0)
     assert known.shape == (0, 2) and not rows.any()
     a, constraint = made.hindsight(known, jnp.array([0.5]))
-    assert (float(a[0]), float(constraint)) == (0.5, 1.0)
+    assert (float(a[0]), float(constraint)) == (0.5, 0.0)
 
 
 def test_units_there_and_back():

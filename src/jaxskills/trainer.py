@@ -65,16 +65,24 @@ class TrainConfig:
     ppo: ppo_lib.PPOConfig = ppo_lib.PPOConfig()
 
 
+# What ends an episode of a family besides a fall. A motion that is new may be far from all that are
+# known, so bounds as tight as SB's keep a family from growing. The authors' code has 0.4 pi for the
+# root too, without which a family of turns grows faster still.
+FAMILY_BOUNDS = bounds_lib.BoundsConfig((0.8, 0.8, 0.8), math.inf, math.inf, math.inf)
+
+
 def for_family(config: TrainConfig = TrainConfig()) -> TrainConfig:
     """Returns a configuration with what FS sets otherwise than SB, for the recipe of a family.
 
     Rewards of FS 4.2, time warp of 4.1; the noise of exploration is that of the authors' code,
-    since with SB's a family does not find what lies beyond its region. These and the number of
-    environments are set whatever `config` has; the rest of it stays.
+    since with SB's a family does not find what lies beyond its region. These, that a fall ends an
+    episode, and the number of environments are set whatever `config` has; bounds are wide unless it
+    has its own; the rest of it stays.
     """
-    env = dataclasses.replace(config.env, reward="tracking", time_warp=True)
+    env = dataclasses.replace(config.env, reward="tracking", time_warp=True, stop="either")
     networks = dataclasses.replace(config.networks, noise=0.1)
-    return dataclasses.replace(config, envs=160, env=env, networks=networks)
+    bounds = FAMILY_BOUNDS if config.bounds == bounds_lib.BoundsConfig() else config.bounds
+    return dataclasses.replace(config, envs=160, env=env, networks=networks, bounds=bounds)
 
 
 @struct.dataclass
@@ -369,7 +377,7 @@ def validate(config: TrainConfig) -> None:
     evolution_lib.validate(config.evolution)
     adaptive_lib.validate(config.adaptive_bounds)
     refine_lib.validate(config.refine)
-    if config.adaptive_bounds.enabled and config.env.stop != "bounds":
+    if config.adaptive_bounds.enabled and config.env.stop == "fall":
         raise UserError(
             f"env.stop is {config.env.stop}: adaptive_bounds need bounds, which end the episodes"
         )

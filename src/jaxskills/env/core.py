@@ -61,7 +61,7 @@ class EnvConfig:
     warp_limits: tuple[float, float] = (-2.0, 1.0)
     style: style_lib.StyleConfig = style_lib.StyleConfig()
     style_weight: float = 0.5  # of the style in a blend, w_s of SB eq. 13
-    stop: Literal["bounds", "fall"] = "bounds"  # what ends an episode; DeepMimic: a fall
+    stop: Literal["bounds", "fall", "either"] = "bounds"  # ends an episode; DeepMimic: fall
     torque_limits: bool = True  # off: servos of any strength, FS section 7.4
     once: bool = False  # an episode is over soon after the first cycle of a motion that loops
     may_touch: tuple[str, ...] | None = None  # the ground: bodies, or `*_knee`; None: the feet
@@ -344,12 +344,12 @@ def make(
         inside = jnp.all(errors <= sizes) & ~touching & ~diverged
         # Who may lie on the ground cannot fall: then leaving the bounds is what loses the skill.
         fallen = jnp.any(clear[no_touch] <= 0.0) if len(no_touch) else ~inside
-        terminated = fallen | diverged if config.stop == "fall" else ~inside
+        left, fell = ~inside & (config.stop != "fall"), fallen & (config.stop != "bounds")
+        terminated = left | fell | diverged
         truncated = (state.step >= max_steps) | (state.phase >= end)
-        worst = jnp.argmax(errors / sizes).astype(jnp.int32)
+        worst, out = jnp.argmax(errors / sizes).astype(jnp.int32), jnp.any(errors > sizes)
         others = len(bounds.names) + jnp.arange(len(OTHER_ENDINGS), dtype=jnp.int32)
-        by_bound = jnp.where(jnp.any(errors > sizes), worst, others[0])
-        ended_by = jnp.where(config.stop == "fall", others[1], by_bound)
+        ended_by = jnp.where(left, jnp.where(out, worst, others[0]), others[1])
         ended_by = jnp.where(diverged, others[2], jnp.where(terminated, ended_by, others[3]))
         torque = servo.applied_torque(servos, layout, sim.qpos, sim.qvel, ctrl)
         report = Report(errors, sizes, inside, fallen, ended_by, seen.bodies.com, torque)

@@ -91,7 +91,8 @@ class Task(NamedTuple):
     step: Callable[..., tuple[jax.Array, jax.Array, jax.Array]]
     # (known, a [P]) -> [P + M] what the policy sees
     observe: Callable[[jax.Array, jax.Array], jax.Array]
-    # (known, a [P]) -> the parameter that was met [P], how well constraints were [] in 0 to 1
+    # (known, a [P]) -> the parameter that was met [P], how well constraints were [] in 0 to 1;
+    # 0 without any
     hindsight: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
     kept: Callable[[jax.Array], jax.Array]  # (known) -> [] bool, whether strict constraints are met
     reference: jax.Array  # [M] what the reference measures
@@ -169,8 +170,8 @@ def make(spec: TaskSpec, character: Character, motion: Motion) -> Task:
         for i, parameter in enumerate(measured):
             if not parameter.fixed:
                 a = a.at[place[i]].set((found[i] - low[i]) / width[i])
-        off = jnp.where(fixed, ((found - low) / sigma) ** 2, 0.0) if measures else jnp.zeros(1)
-        return a, jnp.exp(-jnp.sum(off))
+        off = jnp.where(fixed, ((found - low) / sigma) ** 2, 0.0)
+        return a, jnp.exp(-jnp.sum(off)) if fixed.any() else jnp.float32(0.0)
 
     strict = np.array([p.strict for p in measured], bool)
 

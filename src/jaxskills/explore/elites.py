@@ -142,25 +142,44 @@ def spread(count: int, parameters: int) -> np.ndarray:
     return ((0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0).astype(np.float32)
 
 
-def proxy(elites: Elites, a: jax.Array, neighbours: int = 5, sigma: float = 0.28) -> jax.Array:
-    """Returns motions `[..., M]` for `a [..., P]`, averaged over the nearest elites (FS eq. 14).
+def proxy(
+    elites: Elites,
+    a: jax.Array,
+    neighbours: int = 5,
+    sigma: float = 0.28,
+    ridge: float = 0.03,
+) -> jax.Array:
+    """Returns motions `[..., M]` for `a [..., P]`, by the nearest elites (FS 5.3, eq. 14).
 
-    With fewer elites than `neighbours` all of them are averaged. With none the result is zeros,
-    which is the reference motion.
+    Locally linear regression: the weighted mean of the elites, and on top how they change along the
+    task space, which counts where they lie farther apart than `ridge`. FS names it, but its weights
+    are those of a mean, which is drawn to the middle of the elites: at the rim of what is explored,
+    where the next elite is to be found, it is the motion of a place farther inside. Beyond `sigma`
+    from the mean it stays as there. With fewer elites than `neighbours` all of them count; with
+    none the result is zeros, which is the reference motion.
 
     Args:
       elites: `[C]`.
       a: task parameters.
-      neighbours: k of FS 5.3, how many elites are averaged.
+      neighbours: k of FS 5.3, how many elites count.
       sigma: sigma_k of FS 5.3; weights are fitness times exp(-distance^2 / sigma^2).
+      ridge: a large one, like 100, gives the mean alone.
     """
     squared = jnp.where(elites.used, _distance(elites.a.T, a), jnp.inf)
     closest, rows = jax.lax.top_k(-squared, min(neighbours, elites.used.shape[0]))
     # As logarithms, so that far from all elites not every weight becomes 0.
     score = jnp.log(elites.fitness[rows]) + closest / sigma**2
     score = jnp.where(elites.used[rows], score, -jnp.inf)
-    weight = jax.nn.softmax(score, axis=-1, where=elites.used[rows])
-    return jnp.sum(weight[..., None] * elites.x[rows], axis=-2)
+    weight = jax.nn.softmax(score, axis=-1, where=elites.used[rows])[..., None]
+    near, x = elites.a[rows], elites.x[rows]
+    middle = jnp.sum(weight * near, axis=-2)
+    near = jnp.where(weight > 0.0, near - middle[..., None, :], 0.0)
+    ahead = a - middle
+    far = jnp.linalg.norm(ahead, axis=-1, keepdims=True)
+    ahead = ahead * jnp.minimum(1.0, sigma / jnp.maximum(far, 1e-6))
+    apart = jnp.swapaxes(weight * near, -1, -2) @ near + ridge**2 * jnp.eye(a.shape[-1])
+    lever = jnp.linalg.solve(apart, ahead[..., None])
+    return jnp.sum(weight * (1.0 + near @ lever) * x, axis=-2)
 
 
 def _distance(columns: jax.Array, a: jax.Array) -> jax.Array:

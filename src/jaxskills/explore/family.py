@@ -223,7 +223,7 @@ def best(config: FamilyConfig, family: Family, a: jax.Array) -> jax.Array:
     reference itself as long as nothing else was asked for.
     """
     how, network, elites = config.parameterization, family.network, family.elites
-    likely = elites_lib.proxy(elites, a, how.neighbours, how.sigma)
+    likely = elites_lib.proxy(elites, a, how.neighbours, how.sigma, how.ridge)
     sure = parameterization_lib.trusted(how, network)
     x = jnp.where(sure, parameterization_lib.apply(network, a), likely)
     return jnp.where(family.base.learnt & config.vary, x, 0.0)

@@ -34,8 +34,9 @@ class ParameterizationConfig:
     # The network is trusted when the root mean square of an entry's error (rad, m, log of speed)
     # falls below this. FS 5.3 gives no number; noise of the actions is in the elites and stays.
     threshold: float = 0.1
-    neighbours: int = 5  # k of FS 5.3, elites that the proxy averages
+    neighbours: int = 5  # k of FS 5.3, elites that the proxy goes by
     sigma: float = 0.28  # sigma_k of FS 5.3
+    ridge: float = 0.03  # of the proxy: closer together elites differ by chance
 
 
 @struct.dataclass
@@ -137,7 +138,7 @@ def draw(
     Those of the proxy until the network is trusted, then for each row either with equal chance.
     The key is consumed.
     """
-    likely = elites_lib.proxy(elites, a, config.neighbours, config.sigma)
+    likely = elites_lib.proxy(elites, a, config.neighbours, config.sigma, config.ridge)
     coin = jax.random.bernoulli(key, 0.5, a.shape[:-1]) & trusted(config, state)
     return jnp.where(coin[..., None], apply(state, a), likely)
 
@@ -157,7 +158,7 @@ def validate(config: ParameterizationConfig) -> None:
             raise UserError(
                 f"parameterization.{name} is {getattr(config, name)}: give 1 to 1000000"
             )
-    for name in ("lr", "sigma"):
+    for name in ("lr", "sigma", "ridge"):
         if not 0 < getattr(config, name) < 1000:
             raise UserError(
                 f"parameterization.{name} is {getattr(config, name)}: give a positive number"
