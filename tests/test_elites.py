@@ -72,7 +72,8 @@ def _by_loop(config: EliteConfig, members: list[tuple[float, ...]], episodes: Ep
         near = [m for m in members if np.sum(np.subtract(m[1:], new[1:]) ** 2) < config.radius**2]
         if not near and len(members) == config.capacity:
             near = [min(members)]
-        wins = bool(valid) and new[0] > config.threshold and all(new[0] > m[0] for m in near)
+        able = bool(valid) and all(-config.radius <= x <= 1.0 + config.radius for x in new[1:])
+        wins = able and new[0] > config.threshold and all(new[0] > m[0] for m in near)
         entered.append(wins)
         counted.append(wins and all(new[0] - m[0] >= config.margin for m in near))
         if wins:
@@ -92,7 +93,7 @@ def test_many_episodes_as_by_a_plain_loop(
     found, members = elites_lib.init(config, parameters, parameters + 1), []
     sizes, entries, counts = [], 0, 0
     for _ in range(5):
-        a = random.uniform(-0.1, 1.1, (120, parameters))
+        a = random.uniform(-0.15, 1.15, (120, parameters))
         new = _episodes(a, random.uniform(0.0, 1.0, 120), random.uniform(size=120) < 0.9)
         found, entered, counted = _insert(config, found, new)
         members, expected, expected_counted = _by_loop(config, members, new)
@@ -139,6 +140,12 @@ def test_failed_episodes_stay_out():
     found, entered, counted = _after(SMALL, empty, (0.2, 0.1), (0.8, 0.11))
     assert entered == counted == [False, True]
     assert int(found.used.sum()) == 1
+
+
+def test_who_is_far_outside_of_the_task_space_stays_out():
+    a = np.array([[-0.2, 0.5], [0.5, 1.2], [0.5, 1.05], [-0.05, 0.5]])
+    _, entered, _ = _insert(SMALL, elites_lib.init(SMALL, 2, 3), _episodes(a, np.full(4, 0.5)))
+    np.testing.assert_array_equal(entered, [False, False, True, True])
 
 
 def test_better_by_less_than_the_margin_does_not_count():

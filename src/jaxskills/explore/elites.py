@@ -64,7 +64,8 @@ def insert(
 
     An episode enters if its fitness is above the threshold and above that of all elites within the
     radius, which it replaces. Where there are none and no row is free, it has to beat the least fit
-    elite of all, and replaces that. Episodes that are not valid or not finite are ignored.
+    elite of all, and replaces that. Ignored are episodes that are not valid or finite, or farther
+    outside of the task space than the radius: nobody asks for anything there.
 
     With donated elites only the rows change that are written, else all of `x` is copied once.
 
@@ -75,7 +76,8 @@ def insert(
     """
     finite = jnp.isfinite(episodes.a).all(-1) & jnp.isfinite(episodes.x).all(-1)
     finite &= jnp.isfinite(episodes.fitness)
-    able = episodes.valid & finite & (episodes.fitness > config.threshold)
+    asked_for = (jnp.abs(episodes.a - 0.5) <= 0.5 + config.radius).all(-1)
+    able = episodes.valid & finite & asked_for & (episodes.fitness > config.threshold)
 
     # Motions stay out of the loop: they decide nothing. `writer` tells who was last to take a row.
     def one(carry: tuple[jax.Array, ...], episode: tuple[jax.Array, ...]):
