@@ -180,7 +180,7 @@ def fitness(explored: Explored, place: tuple[int, ...], axes: Axes) -> None:
     if len(place) == 1:
         axes.plot(dots[:, 0], explored.fitness, "o", color=GREEN, ms=4)
         axes.set_xlim(*explored.ranges[place[0]])
-        axes.set_ylim(bottom=0.0)
+        axes.set_ylim(0.0, 1.05 * max(1.0, explored.fitness.max(initial=0.0)))
         finish(axes, title, explored.names[place[0]], "fitness")
     else:
         drawn = axes.scatter(*dots.T, c=explored.fitness, cmap="viridis", vmin=0, **_DOTS)
