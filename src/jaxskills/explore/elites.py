@@ -173,15 +173,13 @@ def proxy(
     score = jnp.log(elites.fitness[rows]) + closest / sigma**2
     score = jnp.where(elites.used[rows], score, -jnp.inf)
     weight = jax.nn.softmax(score, axis=-1, where=elites.used[rows])[..., None]
-    near, x = elites.a[rows], elites.x[rows]
-    middle = jnp.sum(weight * near, axis=-2)
-    near = jnp.where(weight > 0.0, near - middle[..., None, :], 0.0)
-    ahead = a - middle
+    middle = jnp.sum(weight * elites.a[rows], axis=-2)
+    near, ahead = elites.a[rows] - middle[..., None, :], a - middle
     far = jnp.linalg.norm(ahead, axis=-1, keepdims=True)
     ahead = ahead * jnp.minimum(1.0, sigma / jnp.maximum(far, 1e-6))
     apart = jnp.swapaxes(weight * near, -1, -2) @ near + ridge**2 * jnp.eye(a.shape[-1])
     lever = jnp.linalg.solve(apart, ahead[..., None])
-    return jnp.sum(weight * (1.0 + near @ lever) * x, axis=-2)
+    return jnp.sum(weight * (1.0 + near @ lever) * elites.x[rows], axis=-2)
 
 
 def _distance(columns: jax.Array, a: jax.Array) -> jax.Array:
