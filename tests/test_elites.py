@@ -23,7 +23,8 @@ def _episodes(a: np.ndarray, fitness: np.ndarray, valid: np.ndarray | None = Non
     a, fitness = np.asarray(a, np.float32), np.asarray(fitness, np.float32)
     x = np.concatenate((fitness[:, None], a), axis=1)
     valid = np.ones(len(a), bool) if valid is None else valid
-    return Episodes(jnp.asarray(a), jnp.asarray(x), jnp.asarray(fitness), jnp.asarray(valid))
+    a, x, fitness, valid = map(jnp.asarray, (a, x, fitness, valid))
+    return Episodes(a, x, fitness, likeness=fitness, valid=valid)
 
 
 def _line(*pairs: tuple[float, float]) -> Episodes:
@@ -140,6 +141,12 @@ def test_failed_episodes_stay_out():
     found, entered, counted = _after(SMALL, empty, (0.2, 0.1), (0.8, 0.11))
     assert entered == counted == [False, True]
     assert int(found.used.sum()) == 1
+
+
+def test_who_failed_stays_out_also_with_a_constraint_kept():
+    episodes = _line((0.2, 0.15), (0.8, 0.25)).replace(likeness=jnp.array([0.05, 0.15]))
+    _, entered, _ = _insert(SMALL, elites_lib.init(SMALL, 1, 2), episodes)
+    assert entered.tolist() == [False, True]
 
 
 def test_who_is_far_outside_of_the_task_space_stays_out():

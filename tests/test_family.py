@@ -30,7 +30,8 @@ CONFIG = FamilyConfig(
 def _results(a: list[float], success: float = 1.0, reward: float = 0.9, fitness: float = 1.0):
     """Returns one episode for each of `a [Q, 1]`, whose motion is `a` everywhere."""
     rows = jnp.array(a)[:, None]
-    episodes = Episodes(rows, jnp.tile(rows, (1, SIZE)), jnp.full(len(a), fitness), rows[:, 0] > -9)
+    fitness = jnp.full(len(a), fitness)
+    episodes = Episodes(rows, jnp.tile(rows, (1, SIZE)), fitness, fitness, rows[:, 0] > -9)
     states = jnp.tile(rows[:1], (STATES, 1))
     owner = jnp.arange(len(a), dtype=jnp.int32) % 8
     counts = jnp.float32(30), jnp.float32(success), jnp.float32(reward)
@@ -95,7 +96,8 @@ def test_no_more_rows_than_can_be_filled():
     assert [family.roomy(keep, p).capacity for p in (1, 2, 3, 4)] == [256, 484, 5324, 10_000]
     assert family.roomy(EliteConfig(capacity=50), 4).capacity == 50
     points = np.random.default_rng(0).uniform(-0.1, 1.1, (2000, 2)).astype(np.float32)
-    many = Episodes(jnp.asarray(points), jnp.zeros((2000, 1)), jnp.ones(2000), jnp.ones(2000, bool))
+    ones = jnp.ones(2000)
+    many = Episodes(jnp.asarray(points), jnp.zeros((2000, 1)), ones, ones, ones > 0)
     roomy = family.roomy(keep, 2)
     elites, _, _ = elites_lib.insert(roomy, elites_lib.init(roomy, 2, 1), many)
     assert int(elites.used.sum()) < roomy.capacity

@@ -247,14 +247,16 @@ def test_unused_rows_do_not_count_and_nothing_is_worth_nothing(bow: Motion, judg
     assert judge(rows).total == pytest.approx(1.0, abs=1e-5)
     for row in rows[:3]:
         row[:] = np.nan
-    assert dataclasses.astuple(judge(rows, constraint=1.0)) == (0.0,) * 5
+    assert dataclasses.astuple(judge(rows, constraint=1.0)) == (0.0,) * 6
     rows[3][:] = False
-    assert dataclasses.astuple(judge(rows)) == (0.0,) * 5
+    assert dataclasses.astuple(judge(rows)) == (0.0,) * 6
 
 
 def test_constraints_come_on_top(bow: Motion, judge: Callable):
     rows = _episode(bow)
-    assert judge(rows, 1.0).total == pytest.approx(judge(rows).total + 0.1, abs=1e-6)
+    with_them, without = judge(rows, 1.0), judge(rows)
+    assert without.total == without.likeness == with_them.likeness
+    assert with_them.total == pytest.approx(without.total + 0.1, abs=1e-6)
 
 
 def test_many_at_once(who: Character, bow: Motion, judge: Callable):

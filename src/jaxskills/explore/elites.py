@@ -22,7 +22,9 @@ class EliteConfig:
 
     capacity: int = 10_000  # C, at most so many elites; the least fit goes first
     radius: float = 0.1  # r of FS 5.2: no two elites are closer
-    threshold: float = 0.1  # FS 5.2: fitness up to this is a failed episode
+    # FS 5.2: fitness up to this is a failed episode. That is without what constraints add, which
+    # may be as much: whoever keeps them by standing still has failed all the same.
+    threshold: float = 0.1
     margin: float = 0.02  # FS 6.1: better by less does not count for the exploration rate
 
 
@@ -43,6 +45,7 @@ class Episodes:
     a: jax.Array  # [N, P] task parameters they turned out to have
     x: jax.Array  # [N, M] motions
     fitness: jax.Array  # [N]
+    likeness: jax.Array  # [N] fitness without constraints
     valid: jax.Array  # [N] bool, the others are ignored
 
 
@@ -62,10 +65,10 @@ def insert(
 ) -> tuple[Elites, jax.Array, jax.Array]:
     """Returns the elites after N episodes, one after the other (FS 5.2, eq. 13).
 
-    An episode enters if its fitness is above the threshold and above that of all elites within the
-    radius, which it replaces. Where there are none and no row is free, it has to beat the least fit
-    elite of all, and replaces that. Ignored are episodes that are not valid or finite, or farther
-    outside of the task space than the radius: nobody asks for anything there.
+    An episode enters if its likeness is above the threshold and its fitness above that of all
+    elites within the radius, which it replaces. Where there are none and no row is free, it has to
+    beat the least fit elite of all, and replaces that. Ignored are episodes that are not valid or
+    finite, or farther outside of the task space than the radius: nobody asks for anything there.
 
     With donated elites only the rows change that are written, else all of `x` is copied once.
 
@@ -77,7 +80,7 @@ def insert(
     finite = jnp.isfinite(episodes.a).all(-1) & jnp.isfinite(episodes.x).all(-1)
     finite &= jnp.isfinite(episodes.fitness)
     asked_for = (jnp.abs(episodes.a - 0.5) <= 0.5 + config.radius).all(-1)
-    able = episodes.valid & finite & asked_for & (episodes.fitness > config.threshold)
+    able = episodes.valid & finite & asked_for & (episodes.likeness > config.threshold)
 
     # Motions stay out of the loop: they decide nothing. `writer` tells who was last to take a row.
     def one(carry: tuple[jax.Array, ...], episode: tuple[jax.Array, ...]):

@@ -86,9 +86,9 @@ def finished(
         made, covered = trace.trace_to_variation(layout, motion, qpos, phase, tau, valid, knots)
         known = record.known[last, who]
         met, constraint = task.hindsight(known, asked[row])
-        fitness = judge(qpos, qvel, phase, valid, constraint, mine).total
+        judged = judge(qpos, qvel, phase, valid, constraint, mine)
         sound = (last >= 0) & (covered > _LEAST_COVERAGE) & task.kept(known)
-        return met, variation_lib.flatten(made), fitness, sound
+        return met, variation_lib.flatten(made), judged.total, judged.likeness, sound
 
     def group(places: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
         shapes = jax.eval_shape(jax.vmap(one), *places)

@@ -63,7 +63,8 @@ class Fitness:
     velocity: jax.Array  # []
     contact: jax.Array  # []
     drag: jax.Array  # []
-    total: jax.Array  # [] the product, and the constraints' share on top
+    likeness: jax.Array  # [] their product
+    total: jax.Array  # [] with the constraints' share on top
 
 
 # (qpos [T, nq], qvel [T, nv], phase [T], valid [T], constraint []) of one episode, and the bodies
@@ -184,8 +185,9 @@ def fitness(
         (config.drag, jnp.where(stays, slipped, 0.0)),
     )
     factors = [jnp.exp(-jnp.sum(error) / count / scale**2) for scale, error in errors]
-    total = jnp.prod(jnp.stack(factors)) + config.constraint * constraint
-    return Fitness(*factors, total=total)
+    likeness = jnp.prod(jnp.stack(factors))
+    total = likeness + config.constraint * constraint
+    return Fitness(*factors, likeness=likeness, total=total)
 
 
 def validate(config: FitnessConfig) -> None:
