@@ -79,6 +79,8 @@ def test_whole_episodes_are_found_with_what_they_did(who: Character):
     found = episodes.finished(*of, asked, variant, 4, 50, most)
     valid = np.asarray(found.episodes.valid)
     assert valid.sum() == len(whole) and 0 < len(whole) < most
+    places = np.argwhere(np.asarray(episodes.whole(record)))
+    assert [tuple(place) for place in places] == [(t, e) for t, e, _ in whole]
     own = float(asks.reference[0])
     for row, (_, e, _) in enumerate(whole):
         assert int(found.variant[row]) == e % 2

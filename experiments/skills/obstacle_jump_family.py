@@ -2,8 +2,8 @@
 """FS Table 1, ObstacleJump: the height of what one jumps over.
 
 A hurdle 10 cm thick stands where the feet of the clip are highest, 0.22 m. It is 0.15 m high, which
-they clear by 5 cm. Its height is a condition, nothing is measured but that one gets as far as the
-reference: a jump that ends in front of the hurdle, or on it, does not count.
+they clear by 5 cm. Its height is a condition, nothing is measured but that one gets about as far as
+the reference: a jump that ends in front of the hurdle, or on it, does not count.
 """
 
 from jaxskills.env import measure, obstacles
@@ -26,6 +26,7 @@ RECIPE = Recipe(
                 "across",
                 (1.0, 1.0),
                 measure=measure.at(0.98, measure.along("root", (1.0, 0.0, 0.0))),
+                sigma=0.25,  # 0.8 m at least: with both feet behind the hurdle
                 strict=True,
             ),
         )

@@ -29,6 +29,7 @@ RECIPE = Recipe(
                 "across",
                 (1.0, 1.0),
                 measure=measure.at(0.98, measure.along("root", (1.0, 0.0, 0.0))),
+                sigma=0.15,  # 1.7 m at least: with both feet behind the wall
                 strict=True,
             ),
         )

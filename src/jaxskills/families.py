@@ -266,7 +266,7 @@ def _results(a: jax.Array, practice: Practice, found: episodes.Found) -> family_
     # Who began too late to get through in this update counts neither way.
     left = steps - jnp.arange(steps)[:, None]
     enough = first & (left > jnp.max(jnp.where(record.finished, record.step, 0)))
-    done = jnp.sum(found.episodes.valid)
+    done = jnp.sum(episodes.whole(record))  # whether they keep a strict constraint or not
     success = jnp.minimum(done / jnp.maximum(jnp.sum(enough), 1), 1.0)
     many = jnp.broadcast_to(a, (*record.phase.shape, a.shape[-1])).reshape(-1, a.shape[-1])
     begun = jnp.sum(record.step == 0)

@@ -72,8 +72,7 @@ def finished(
       longest: control steps of an episode at most.
       most: Q, how many there may be.
     """
-    whole = record.finished & (_at_begin(record) < 0.5)
-    last, who = jnp.nonzero(whole, size=most, fill_value=-1)
+    last, who = jnp.nonzero(whole(record), size=most, fill_value=-1)
 
     def one(last: jax.Array, who: jax.Array) -> tuple[jax.Array, ...]:
         row = variant[who]
@@ -98,6 +97,11 @@ def finished(
     split = lambda x: x.reshape(-1, _GROUP)  # noqa: E731
     rows = jax.lax.map(group, (split(last), split(who)))
     return Found(Episodes(*(x.reshape(most, *x.shape[2:]) for x in rows)), variant[who])
+
+
+def whole(record: Record) -> jax.Array:
+    """Returns bool `[T, B]`, an episode from phase 0 got through the motion in this step."""
+    return record.finished & (_at_begin(record) < 0.5)
 
 
 def room(steps: int, envs: int, shortest: int) -> int:
