@@ -101,15 +101,18 @@ def _ablation(skill: str, samples: int) -> dict[str, Case]:
 
 def _curricula(skill: str, samples: int) -> dict[str, Case]:
     """FS fig. 8."""
-    how = f"--samples {samples} --family.curriculum.method"
+    how = f"--samples {samples}"
     methods = {
-        "ours": "alternating_by_rate",
         "uniform": "uniform",
         "explore_only": "explore_only",
         "mastering": "mastering",
         "alternating": "fixed_alternation",
     }
-    return {name: Case(skill, _of(f"{how} {method}")) for name, method in methods.items()}
+    cases = {
+        name: Case(skill, _of(f"{how} --family.curriculum.method {method}"))
+        for name, method in methods.items()
+    }
+    return {"ours": Case(skill, _of(how))} | cases
 
 
 def _stops(skill: str, samples: int) -> dict[str, Case]:
@@ -160,11 +163,11 @@ COMPARISONS: dict[str, dict[str, Case]] = {
     "run_styles": _transfers("run_styles", "run_style", ("happy_walk", "bent_walk"), 4_000_000),
     "cartwheel_blend": _blends("cartwheel_style", "energy_down", "cartwheel_styles/plain"),
     # Families of skills
-    "spinkick_ablation": _ablation("spinkick_family", 10_000_000),
-    "jump_ablation": _ablation("jump_gravity_family", 10_000_000),
-    "dodge_curricula": _curricula("dodge_family", 4_000_000),
-    "jump_curricula": _curricula("jump_gravity_family", 10_000_000),
-    "dodge_stop": _stops("dodge_family", 2_000_000),
+    "spinkick_ablation": _ablation("spinkick_family", 2_000_000),
+    "jump_ablation": _ablation("jump_gravity_family", 4_000_000),
+    "dodge_curricula": _curricula("dodge_family", 1_000_000),
+    "jump_curricula": _curricula("jump_gravity_family", 4_000_000),
+    "dodge_stop": _stops("dodge_family", 1_000_000),
     "spinkick_stop": _stops("spinkick_family", 2_000_000),
     "push_torque": _switched(
         "push_family", 4_000_000, "limited", "unlimited", "--env.no-torque-limits"
