@@ -87,6 +87,15 @@ def test_the_policy_chooses_how_fast_phase_goes_by(family: Environment):
             assert float(after.phase) == pytest.approx(3.0 + float(outcome.dphase), rel=1e-5)
 
 
+def test_nobody_hurries_through_the_hold_after_the_end(family: Environment):
+    for phase, dphase in ((29.9, np.exp(1.2)), (30.1, 1.0)):
+        state = family.start(jnp.float32(phase), jnp.int32(1))
+        after, outcome = family.step(state, STILL.at[5].set(5.0))
+        assert float(outcome.dphase) == pytest.approx(dphase, rel=1e-5)
+        assert float(after.phase) == pytest.approx(phase + dphase, rel=1e-5)
+    assert float(family.observe(after)[-3]) == 0.0  # log of the speed
+
+
 def test_tracking_pays_one_a_frame_on_the_reference(family: Environment):
     for variant in range(2):
         state = family.start(jnp.float32(3.0), jnp.int32(variant))

@@ -189,7 +189,8 @@ def make(
 
     def natural_speed(state: EnvState) -> jax.Array:
         own = pick(variants, state.variant)
-        return variation_lib.rate(own.motion, own.variation, state.phase)
+        speed = variation_lib.rate(own.motion, own.variation, state.phase)
+        return jnp.where(state.phase < end - _HOLD, speed, 1.0)
 
     def features(state: EnvState, seen: _Seen) -> jax.Array:
         parts = [_features(state, seen)]
@@ -239,7 +240,8 @@ def make(
             return jnp.float32(1.0), jnp.float32(1.0)
         natural = natural_speed(state)
         warp = jnp.clip(config.warp_scale * action[-1], *config.warp_limits)
-        return natural * jnp.exp(warp), natural
+        # Who could hurry through the hold would end in the air, and never land.
+        return natural * jnp.exp(jnp.where(state.phase < end - _HOLD, warp, 0.0)), natural
 
     def around(state: EnvState, dphase: jax.Array) -> tuple[SimState, list[jax.Array]]:
         """Returns the simulation with its objects in place, and what they and holds are told."""
@@ -275,12 +277,7 @@ def make(
 
     def imitation(seen: _Seen) -> jax.Array:
         return rewards.imitation(
-            weights,
-            seen.offset,
-            seen.velocity_error,
-            seen.effectors,
-            seen.bodies,
-            seen.reference,
+            weights, seen.offset, seen.velocity_error, seen.effectors, seen.bodies, seen.reference
         )
 
     def style(own: Variant, seen: _Seen, before: SimState, after: EnvState) -> jax.Array:
