@@ -76,6 +76,17 @@ def test_phases_take_turns_while_nothing_is_found():
     assert _phases(dataclasses.replace(config, idle=0.0), [(1, 0), *nothing]) == "E" * 13
 
 
+def test_nothing_new_is_explored_while_few_get_through():
+    """Rates speak for exploration all along."""
+    update = jit(functools.partial(curriculum.update, QUICK))
+    state, phases = curriculum.init(QUICK, WHERE), ""
+    region = jnp.array([SURROUNDING, SURROUNDING, VISITED, VISITED])
+    for success in (0.9, 0.4, 0.6, 0.4, 0.4, 0.4, 0.6, 0.4, 0.5, 0.5):
+        state = update(state, region, jnp.array([1, 1, 0, 0]), jnp.float32(success))
+        phases += NAMES[int(state.phase)]
+    assert phases == "EEEE" + "RRRRR" + "E"
+
+
 def test_rates_are_running_means_per_task_parameter():
     """The first count alike, later ones a fifth; a region without samples keeps its rate."""
     config = dataclasses.replace(QUICK, memory=0.8)
@@ -310,6 +321,7 @@ def test_a_region_grows_from_the_reference_to_the_whole_space():
         ({"renew": 0}, "curriculum.renew is 0: give 1 or more"),
         ({"probes": 0}, "curriculum.probes is 0: give 1 to 19"),
         ({"probes": 20}, "curriculum.probes is 20: give 1 to 19"),
+        ({"success": 1.0}, "curriculum.success is 1.0: give 0 <= success < 1"),
         ({"idle": -0.1}, "curriculum.idle is -0.1: give a rate of 0 or more"),
         ({"idle_duration": 0}, "curriculum.idle_duration is 0: give 1 or more"),
         ({"memory": 1.0}, "curriculum.memory is 1.0: give 0 <= memory < 1"),

@@ -11,7 +11,9 @@ lie apart: 0.2 of it stays after the first update, 0.8^2 of that at the third.
 
 FS does not say what happens when neither region gives anything, which is not the end: a policy that
 explores one side of its region unlearns the other, and then does not even get to its own elites.
-Then phases of a fixed length take turns, until something is found again.
+Then phases of a fixed length take turns, until something is found again. Nor does it say what keeps
+exploration from running ahead of the policy, which then gets through nothing, neither the new nor
+what it knew: while few episodes get through, nothing new is explored.
 """
 
 import dataclasses
@@ -49,6 +51,7 @@ class CurriculumConfig:
     probes: int = 2  # of a batch come from the region that it is not the phase of
     memory: float = 0.8  # of the running mean of an exploration rate, with each update
     patience: int = 3  # updates in a row must speak for a change of phase; of mastering too
+    success: float = 0.5  # with fewer episodes that get through there is refinement
     idle: float = 0.01  # with both rates below that, nothing is found,
     idle_duration: int = 8  # and phases have so many updates
     # explore_only
@@ -141,7 +144,11 @@ def draw(
 
 
 def update(
-    config: CurriculumConfig, state: Curriculum, region: jax.Array, found: jax.Array
+    config: CurriculumConfig,
+    state: Curriculum,
+    region: jax.Array,
+    found: jax.Array,
+    success: jax.Array | float = 1.0,
 ) -> Curriculum:
     """Returns the curriculum after a batch, perhaps in the other phase (FS 6.3).
 
@@ -150,13 +157,14 @@ def update(
       state: before.
       region: `[batch]` of its task parameters.
       found: `[batch]` new elites that count, of the episodes of each task parameter.
+      success: `[]` share of the episodes that got through the motion.
     """
     # Only all over an explored space does this method draw none of the surroundings.
     around, inside = (region == SURROUNDING).any(), (region == VISITED).any()
     complete = inside & ~around & (config.method == "alternating_by_rate")
     state = _measured(config, state, region, found, complete)
     age = state.age + 1
-    wish, hurry = _opinion(config, state, age, complete)
+    wish, hurry = _opinion(config, state, age, complete, success < config.success)
     streak = jnp.where(wish, state.streak + 1, 0)
     change = (streak >= config.patience) | hurry
     return dataclasses.replace(
@@ -190,7 +198,11 @@ def _measured(
 
 
 def _opinion(
-    config: CurriculumConfig, state: Curriculum, age: jax.Array, complete: jax.Array
+    config: CurriculumConfig,
+    state: Curriculum,
+    age: jax.Array,
+    complete: jax.Array,
+    poor: jax.Array | bool,
 ) -> tuple[jax.Array, jax.Array]:
     """Returns whether this update speaks for the other phase, and whether it comes at once."""
     exploring, no = state.phase == EXPLORATION, jnp.asarray(False)
@@ -200,7 +212,9 @@ def _opinion(
             more = ~complete & (state.rate[0] > state.rate[1])
             known, idle = (state.seen > 0).all(), (state.rate < config.idle).all() & ~complete
             decided = jnp.where(exploring, less, more) & known & ~idle
-            return decided, idle & known & (age >= config.idle_duration)
+            decided = jnp.where(exploring, decided | poor, decided & ~poor)
+            turn = idle & known & (age >= config.idle_duration)
+            return decided, turn & (exploring | ~jnp.asarray(poor))
         case "mastering":
             mastered = state.value >= config.mastery
             return jnp.where(exploring, ~mastered, mastered), age >= config.timeout
@@ -232,6 +246,8 @@ def validate(config: CurriculumConfig) -> None:
         raise UserError(f"curriculum.probes is {config.probes}: give 1 to {config.batch - 1}")
     if not 0 <= config.idle < math.inf:
         raise UserError(f"curriculum.idle is {config.idle}: give a rate of 0 or more")
+    if not 0 <= config.success < 1:
+        raise UserError(f"curriculum.success is {config.success}: give 0 <= success < 1")
     if not 0 <= config.memory < 1:
         raise UserError(f"curriculum.memory is {config.memory}: give 0 <= memory < 1")
     if not 0 < config.full <= 1:

@@ -176,7 +176,7 @@ def update(
     curriculum = jax.lax.cond(
         family.base.learnt,
         lambda: curriculum_lib.update(
-            config.curriculum, family.curriculum, family.asked.region, found
+            config.curriculum, family.curriculum, family.asked.region, found, results.success
         ),
         lambda: family.curriculum,
     )

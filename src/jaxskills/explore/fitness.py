@@ -23,14 +23,16 @@ from jaxskills.kinematics import BodyParams, Tree
 from jaxskills.motion import Motion, sample
 from jaxskills.trace import neighbours, usable
 
+_AXES = 57  # of joints, that the scales of FitnessConfig are for
+
 
 @dataclasses.dataclass(frozen=True)
 class FitnessConfig:
     """Scales sigma of FS eq. 10, for sums over joints or bodies and means over phase.
 
-    Sums grow with the character. The printed numbers are for 57 of them: 2.67^2 = 57 / 8, 75.5^2 =
-    57 * 100, with 8 and 0.01 the factors of means in the authors' code. The 63 of `human21` make
-    it a tenth stricter, the 28 of `humanoid34` half as strict.
+    Sums grow with the character. The first two numbers are printed for 57 axes of joints: 2.67^2 =
+    57 / 8, 75.5^2 = 57 * 100, with 8 and 0.01 the factors of means in the authors' code. Their
+    squares count in proportion to the axes of the character, so that all are judged alike.
     """
 
     pose: float = 2.67  # rad
@@ -178,9 +180,10 @@ def fitness(
     stays = touching[1:] & touching[:-1]
     slipped = jnp.sum((episode.place[1:] - episode.place[:-1]) ** 2, -1)
     lifted = (reference.height - episode.height) ** 2
+    size = math.sqrt(offset.shape[-1] / _AXES)
     errors = (
-        (config.pose, offset**2),
-        (config.velocity, astray / jnp.maximum(config.slow, fast)),
+        (size * config.pose, offset**2),
+        (size * config.velocity, astray / jnp.maximum(config.slow, fast)),
         (config.contact, jnp.where(touching, lifted, 0.0)),
         (config.drag, jnp.where(stays, slipped, 0.0)),
     )
