@@ -54,8 +54,8 @@ class EnvConfig:
     # weighted (SB eq. 13, for comparison), or tracking and a task (FS eq. 5).
     reward: Literal["survival", "imitation", "style", "blend", "tracking"] = "survival"
     tracking: tracking_lib.TrackingConfig = tracking_lib.TrackingConfig()
-    # The policy chooses how fast phase goes by too, FS eq. 3 and 4. Scale and limits of the log of
-    # the speed, relative to the reference's own, are those of the authors' code.
+    # The policy chooses how fast phase goes by too, FS eq. 3 and 4: the log of the speed is that of
+    # the reference and so many times its action. Scale and limits are those of the authors' code.
     time_warp: bool = False
     warp_scale: float = 1.5
     warp_limits: tuple[float, float] = (-2.0, 1.0)
@@ -239,9 +239,10 @@ def make(
         if not config.time_warp:
             return jnp.float32(1.0), jnp.float32(1.0)
         natural = natural_speed(state)
-        warp = jnp.clip(config.warp_scale * action[-1], *config.warp_limits)
+        chosen = jnp.log(natural) + config.warp_scale * action[-1]
+        chosen = jnp.exp(jnp.clip(chosen, *config.warp_limits))
         # Who could hurry through the hold would end in the air, and never land.
-        return natural * jnp.exp(jnp.where(state.phase < end - _HOLD, warp, 0.0)), natural
+        return jnp.where(state.phase < end - _HOLD, chosen, 1.0), natural
 
     def around(state: EnvState, dphase: jax.Array) -> tuple[SimState, list[jax.Array]]:
         """Returns the simulation with its objects in place, and what they and holds are told."""
