@@ -173,7 +173,8 @@ def make(
     length, loop = variants.length, variants.loop
     scene = objects.scene(character, length)
     mine = lambda x: x if scene is None else x[: layout.own.nv]  # noqa: E731  no objects
-    end = math.inf if loop and not config.once else length + _HOLD
+    over = math.inf if loop and not config.once else length  # from there on a pose is held
+    end = over + _HOLD
     endings = (*bounds.names, *OTHER_ENDINGS)
 
     def look(state: EnvState) -> _Seen:
@@ -190,7 +191,7 @@ def make(
     def natural_speed(state: EnvState) -> jax.Array:
         own = pick(variants, state.variant)
         speed = variation_lib.rate(own.motion, own.variation, state.phase)
-        return jnp.where(state.phase < end - _HOLD, speed, 1.0)
+        return jnp.where(state.phase < over, speed, 1.0)
 
     def features(state: EnvState, seen: _Seen) -> jax.Array:
         parts = [_features(state, seen)]
@@ -242,7 +243,7 @@ def make(
         chosen = jnp.log(natural) + config.warp_scale * action[-1]
         chosen = jnp.exp(jnp.clip(chosen, *config.warp_limits))
         # Who could hurry through the hold would end in the air, and never land.
-        return jnp.where(state.phase < end - _HOLD, chosen, 1.0), natural
+        return jnp.where(state.phase < over, chosen, 1.0), natural
 
     def around(state: EnvState, dphase: jax.Array) -> tuple[SimState, list[jax.Array]]:
         """Returns the simulation with its objects in place, and what they and holds are told."""
