@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Regions by hand; samples against the distributions that they should have."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -219,15 +220,19 @@ def test_none_but_members_are_chosen():
         assert member[np.asarray(found[:, 0]).astype(int)].all()
 
 
-def test_mcmc_of_one_parameter():
-    """V = 1 + a up to 0.7, where the region ends: p = exp(-10 (a - 0.35) / 1.35)."""
+@pytest.mark.parametrize("limit", [1e6, 3.0, 1.0])
+def test_mcmc_of_one_parameter(limit: float):
+    """V = 1 + a up to 0.7, where the region ends: p = exp(-10 (a - 0.35) / 1.35), limited."""
     inside = lambda a: jnp.where(a[0] < 0.7, 1.0, 0.0)  # noqa: E731
     value = lambda a: 1.0 + a[..., 0]  # noqa: E731
-    pool = np.asarray(_many(functools.partial(_mcmc, inside, value, jnp.array([0.2])), 40))
+    config = dataclasses.replace(CONFIG, limit=limit)
+    draw = functools.partial(_mcmc, inside, value, jnp.array([0.2]), config=config)
+    pool = np.asarray(_many(draw, 40))
     assert pool.shape == (40, 300, 1)
     assert pool.min() >= 0.0 and pool.max() < 0.7
-    edges = np.linspace(0.0, 0.7, 8)
-    _agrees(pool, [edges], -np.diff(np.exp(-10.0 * edges / 1.35)))
+    fine = (np.arange(7000) + 0.5) * 1e-4
+    p = np.clip(np.exp(-10.0 * (fine - 0.35) / 1.35), 1.0 / limit, limit)
+    _agrees(pool, [np.linspace(0.0, 0.7, 8)], p.reshape(7, 1000).sum(1))
 
 
 def _islands(a: Any, module: Any) -> Any:
@@ -244,7 +249,9 @@ def _worth(a: Any) -> Any:
 def test_mcmc_of_two_islands():
     """No chain crosses the gap: their shares are those of the starting points."""
     density = lambda a: jnp.where(_islands(a, jnp), 1.0, 0.0)  # noqa: E731
-    pool = np.asarray(_many(functools.partial(_mcmc, density, _worth, jnp.array([0.3, 0.2])), 40))
+    config = dataclasses.replace(CONFIG, limit=1e6)
+    draw = functools.partial(_mcmc, density, _worth, jnp.array([0.3, 0.2]), config=config)
+    pool = np.asarray(_many(draw, 40))
     assert _islands(pool, np).all() and pool.min() >= 0.0
     fine = (np.arange(1000) + 0.5) / 1000
     grid = np.stack(np.meshgrid(fine, fine, indexing="ij"), -1)
@@ -293,6 +300,7 @@ def test_reflection():
         ({"visited": float("nan")}, "sampling.surrounding, visited are 0.2, nan: give 0 <="),
         ({"candidates": 7}, "sampling.candidates is 7: give 8 to 1000000"),
         ({"preference": -1.0}, "sampling.preference is -1.0: give 0 to 1000"),
+        ({"limit": 0.9}, "sampling.limit is 0.9: give a factor of 1 or more"),
         ({"pool": 0}, "sampling.pool is 0: give 1 or more"),
         ({"chains": 0}, "sampling.chains is 0: give 1 or more"),
         ({"thin": 0}, "sampling.thin is 0: give 1 or more"),

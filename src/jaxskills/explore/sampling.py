@@ -8,6 +8,7 @@ has the weight that makes the whole uniform again.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import jax
@@ -35,6 +36,10 @@ class SamplingConfig:
     surrounding: float = 0.2  # D': from here to D lie the surroundings
     candidates: int = 4096  # points of which those in a region are taken
     preference: float = 10.0  # k of FS eq. 17, for low marginal values
+    # A parameter is up to so many times as likely as one of mean value, or down to as many times
+    # less. Without a limit, where a policy fails is a thousand times as likely as the rest, and
+    # the rest, no longer practised, is unlearnt.
+    limit: float = 3.0
     pool: int = 1000  # task parameters that MCMC draws at a time
     chains: int = 50  # starting points
     thin: int = 5  # steps of a chain from one that is kept to the next
@@ -121,10 +126,10 @@ def mcmc(
 ) -> jax.Array:
     """Returns `[pool, P]` of the heavily visited region, more where the value is low (FS eq. 17).
 
-    p(a) = exp(-k (V(a) - mu) / mu), mu the mean of V over the region. A chain each from many
-    starting points (Won and Lee 2019), by Metropolis' rule. Parts of the region with a gap between
-    them are beyond a chain's reach, so the starting points are drawn by p already. Where nothing is
-    visited all are the reference.
+    p(a) = exp(-k (V(a) - mu) / mu), mu the mean of V over the region, from 1 / limit to the limit.
+    A chain each from many starting points (Won and Lee 2019), by Metropolis' rule. Parts of the
+    region with a gap between them are beyond a chain's reach, so the starting points are drawn by p
+    already. Where nothing is visited all are the reference.
 
     Args:
       config: how.
@@ -144,13 +149,17 @@ def mcmc(
     spread = jnp.sqrt(share @ (worth - mu) ** 2)
     slope = config.preference / jnp.maximum(jnp.maximum(jnp.abs(mu), 0.1 * spread), 1e-6)
 
-    level = jnp.where(member, -slope * (worth - mu), -jnp.inf)
+    def preferred(worth: jax.Array) -> jax.Array:
+        most = math.log(config.limit)
+        return jnp.clip(-slope * (worth - mu), -most, most)
+
+    level = jnp.where(member, preferred(worth), -jnp.inf)
     weight = points.weight * jnp.exp(level - jnp.max(level, initial=-1e30))
     start = _chosen(points, member, weight, reference, start_key, config.chains)
 
     def log_p(a: jax.Array) -> jax.Array:
         inside = region(config, jax.vmap(density)(a)) == VISITED
-        return jnp.where(inside, -slope * (value(a) - mu), -jnp.inf)
+        return jnp.where(inside, preferred(value(a)), -jnp.inf)
 
     return _walk(config, log_p, start, walk_key)
 
@@ -225,6 +234,8 @@ def validate(config: SamplingConfig) -> None:
         raise UserError(f"sampling.candidates is {config.candidates}: give 8 to 1000000")
     if not 0 <= config.preference < 1000:
         raise UserError(f"sampling.preference is {config.preference}: give 0 to 1000")
+    if not 1 <= config.limit < math.inf:
+        raise UserError(f"sampling.limit is {config.limit}: give a factor of 1 or more")
     for name in ("pool", "chains", "thin"):
         if getattr(config, name) < 1:
             raise UserError(f"sampling.{name} is {getattr(config, name)}: give 1 or more")
