@@ -76,6 +76,13 @@ def test_phases_take_turns_while_nothing_is_found():
     assert _phases(dataclasses.replace(config, idle=0.0), [(1, 0), *nothing]) == "E" * 13
 
 
+def test_refinement_ends_after_some_updates():
+    """It finds more than its probes all along; then exploration does not, twice in a row."""
+    config = dataclasses.replace(QUICK, longest=4)
+    assert _phases(config, [(1, 2)] * 13) == "E" + "RRRR" + "EE" + "RRRR" + "EE"
+    assert _phases(QUICK, [(1, 2)] * 13) == "E" + "R" * 12
+
+
 def test_nothing_new_is_explored_while_few_get_through():
     """Rates speak for exploration all along."""
     update = jit(functools.partial(curriculum.update, QUICK))

@@ -91,6 +91,18 @@ def test_new_elites_count_for_whoever_was_asked():
     assert float(jnp.abs(state.curriculum.rate - before).sum()) > 0.0
 
 
+def test_small_changes_are_for_refinement_alone():
+    """Not for the reference, though its curriculum may say so, nor for exploration."""
+    config, state = dataclasses.replace(CONFIG, refining_kl=0.25), _begin()
+    for learnt, phase, expected in [(0, 1, 1.0), (1, 0, 1.0), (1, 1, 0.25)]:
+        now = state.replace(
+            base=state.base.replace(learnt=jnp.bool_(learnt)),
+            curriculum=state.curriculum.replace(phase=jnp.int32(phase)),
+        )
+        assert float(family.caution(config, now)) == expected
+        assert float(family.caution(CONFIG, now)) == 1.0
+
+
 def test_no_more_rows_than_can_be_filled():
     keep = EliteConfig(capacity=10_000, radius=0.1)
     assert [family.roomy(keep, p).capacity for p in (1, 2, 3, 4)] == [256, 484, 5324, 10_000]
@@ -104,7 +116,8 @@ def test_no_more_rows_than_can_be_filled():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("episodes", 0.5), ("late", 1.0), ("base_success", -0.1)]
+    ("name", "value"),
+    [("episodes", 0.5), ("late", 1.0), ("base_success", -0.1), ("refining_kl", 0.0)],
 )
 def test_values_out_of_range_are_named(name: str, value: float):
     with pytest.raises(UserError, match=f"family.{name} is {value}"):

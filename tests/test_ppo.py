@@ -178,6 +178,31 @@ def test_a_large_gradient_is_cut_to_its_greatest_norm(nets: Networks):
     assert norm == pytest.approx(0.1 * 1e-3, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("kl", "expected"), [(0.061, 2e-3), (0.059, 3e-3), (0.016, 3e-3), (0.014, 4.5e-3)]
+)
+def test_the_step_size_follows_the_change_of_the_policy(kl: float, expected: float):
+    """Down by a third above 0.06, up by half below 0.015: twice and half of the target."""
+    lr = ppo.next_lr(PPOConfig(target_kl=0.03), jnp.float32(3e-3), jnp.float32(kl))
+    assert float(lr) == pytest.approx(expected, rel=1e-5)
+    assert float(ppo.next_lr(PPOConfig(target_kl=0.0), jnp.float32(3e-3), jnp.float32(kl))) == (
+        pytest.approx(3e-3)
+    )
+
+
+def test_a_share_of_the_target_makes_the_steps_smaller(nets: Networks):
+    """With these steps divergences lie between half of the target and twice a tenth of it."""
+    learner = ppo.init(CONFIG, nets, jax.random.key(0))
+    batch = _batch(nets, learner)
+    _, watched = ppo.update(CONFIG, nets, learner, batch, jax.random.key(1))
+    config = dataclasses.replace(CONFIG, target_kl=float(watched["kl"]))
+    lrs = [
+        float(ppo.update(config, nets, learner, batch, jax.random.key(1), share)[0].policy_lr)
+        for share in (1.0, 0.1)
+    ]
+    assert lrs == pytest.approx([1e-2, 1e-2 / 1.5], rel=1e-5)
+
+
 def test_jitted_and_plain_updates_agree(nets: Networks):
     learner = ppo.init(CONFIG, nets, jax.random.key(0))
     batch, key = _batch(nets, learner), jax.random.key(1)

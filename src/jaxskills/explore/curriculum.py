@@ -13,7 +13,9 @@ FS does not say what happens when neither region gives anything, which is not th
 explores one side of its region unlearns the other, and then does not even get to its own elites.
 Then phases of a fixed length take turns, until something is found again. Nor does it say what keeps
 exploration from running ahead of the policy, which then gets through nothing, neither the new nor
-what it knew: while few episodes get through, nothing new is explored.
+what it knew: while few episodes get through, nothing new is explored. And a few probes find less
+than a batch that the policy learns from, so refinement, which always finds a little, ends after
+some updates anyway.
 """
 
 import dataclasses
@@ -54,6 +56,7 @@ class CurriculumConfig:
     success: float = 0.5  # with fewer episodes that get through there is refinement
     idle: float = 0.01  # with both rates below that, nothing is found,
     idle_duration: int = 8  # and phases have so many updates
+    longest: int = 20  # updates of refinement at a time, if more get through
     # explore_only
     full: float = 0.99  # share of the task space that is everything
     # mastering
@@ -214,6 +217,7 @@ def _opinion(
             decided = jnp.where(exploring, less, more) & known & ~idle
             decided = jnp.where(exploring, decided | poor, decided & ~poor)
             turn = idle & known & (age >= config.idle_duration)
+            turn |= ~exploring & ~complete & (age >= config.longest)
             return decided, turn & (exploring | ~jnp.asarray(poor))
         case "mastering":
             mastered = state.value >= config.mastery
@@ -235,7 +239,7 @@ def validate(config: CurriculumConfig) -> None:
     if config.method not in get_args(Method):
         raise unknown("curriculum method", config.method, get_args(Method))
     sampling.validate(config.sampling)
-    for name in ("batch", "renew", "patience", "idle_duration", "timeout", "duration"):
+    for name in ("batch", "renew", "patience", "idle_duration", "longest", "timeout", "duration"):
         if getattr(config, name) < 1:
             raise UserError(f"curriculum.{name} is {getattr(config, name)}: give 1 or more")
     if config.batch > config.sampling.pool:

@@ -58,6 +58,9 @@ class FamilyConfig:
     base_growth: float = 0.02  # share of the reward
     base_patience: int = 3  # updates
     base_memory: float = 0.7  # of the running means of both, with each update
+    # Of `ppo.target_kl` while refining. Large changes of the policy find new motions, small ones
+    # perform the known ones well.
+    refining_kl: float = 1.0
     variation: VariationConfig = VariationConfig()
     elites: elites_lib.EliteConfig = elites_lib.EliteConfig()
     fitness: fitness_lib.FitnessConfig = fitness_lib.FitnessConfig()
@@ -229,6 +232,12 @@ def best(config: FamilyConfig, family: Family, a: jax.Array) -> jax.Array:
     return jnp.where(family.base.learnt & config.vary, x, 0.0)
 
 
+def caution(config: FamilyConfig, family: Family) -> jax.Array:
+    """Returns the share `[]` of `ppo.target_kl` that the policy's changes aim at now."""
+    refining = family.base.learnt & (family.curriculum.phase == curriculum_lib.REFINEMENT)
+    return jnp.where(refining, config.refining_kl, 1.0)
+
+
 def _base(config: FamilyConfig, base: Base, results: Results) -> Base:
     new = jnp.maximum(1.0 - config.base_memory, 1.0 / (base.updates + 1.0))
     success = base.success + new * (results.success - base.success)
@@ -287,6 +296,8 @@ def validate(config: FamilyConfig) -> None:
     for name in ("late", "base_late", "base_success", "base_growth", "base_memory"):
         if not 0 <= getattr(config, name) < 1:
             raise UserError(f"family.{name} is {getattr(config, name)}: give 0 <= {name} < 1")
+    if not 0 < config.refining_kl <= 1:
+        raise UserError(f"family.refining_kl is {config.refining_kl}: give 0 < refining_kl <= 1")
     if config.base_patience < 0:
         raise UserError(f"family.base_patience is {config.base_patience}: give 0 or more")
     elites_lib.validate(config.elites)
