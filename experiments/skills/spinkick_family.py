@@ -7,6 +7,7 @@ this clip, whose kick is 0.3 m higher than the paper's, for feet 2.7 m high.
 
 from jaxskills.env import measure
 from jaxskills.env.task import Parameter, TaskSpec
+from jaxskills.explore.family import FamilyConfig
 from jaxskills.learn.ppo import PPOConfig
 from jaxskills.recipes import Recipe
 from jaxskills.trainer import TrainConfig, for_family
@@ -34,6 +35,12 @@ RECIPE = Recipe(
         )
     ),
     # Updates of whole episodes, fewer and larger: with short ones the policy imitates worse and
-    # worse while it explores.
-    config=for_family(TrainConfig(horizon=48, ppo=PPOConfig(policy_lr=1e-4, target_kl=0.08))),
+    # worse while it explores. With steps as large it would get through less of what it knows.
+    config=for_family(
+        TrainConfig(
+            horizon=48,
+            ppo=PPOConfig(policy_lr=1e-4, target_kl=0.08),
+            family=FamilyConfig(refining_kl=0.25),
+        )
+    ),
 )
