@@ -111,8 +111,7 @@ def family_controller(made: Trainer, state: TrainState) -> Controller:
 
 
 def _asked(config: TrainConfig, family: Family, a: jax.Array) -> Asked:
-    x = family_lib.best(config.family, family, a[None])
-    return Asked(a[None], jnp.zeros(1, jnp.int32), x)
+    return family_lib.best(config.family, family, a[None])
 
 
 def _start(own: Parts, world: World, asked: Asked) -> Playing:

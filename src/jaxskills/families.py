@@ -103,10 +103,11 @@ def parts(config: TrainConfig, spec: TaskSpec) -> Parts:
 def environment(own: Parts, world: World, asked: family_lib.Asked) -> core.Environment:
     """Returns the environment of a batch of task parameters. Its arrays may be traced."""
     layout, length = own.character.layout, float(own.shown.length)
-    made = variation_lib.unflatten(asked.x, layout.own.nv)
-    displace = jax.vmap(functools.partial(variation_lib.displace, layout))
-    motions = jax.jit(displace)(world.motion, made)  # on the host too, and at once
-    rows = variants.Variant(motions, made, world.body, world.shapes, asked.a, world.holds)
+    made, fed = (variation_lib.unflatten(x, layout.own.nv) for x in (asked.x, asked.fed))
+    displace = jax.jit(jax.vmap(functools.partial(variation_lib.displace, layout)))
+    motions = displace(world.motion, made)  # on the host too, and at once
+    ahead = variants.Fed(displace(world.motion, fed), fed)
+    rows = variants.Variant(motions, made, world.body, world.shapes, asked.a, world.holds, ahead)
     both = variants.Variants(rows, world.model, asked.a.shape[0], length, own.shown.loop)
     config = env_config(own.config, own.shown)
     return core.make(own.character, both, own.engine, own.bounds, config, task=own.task)

@@ -119,8 +119,7 @@ def _perform(
 ) -> Performances:
     assert state.family is not None
     config, layout, count = own.config, own.character.layout, a.shape[0]
-    x = family_lib.best(config.family, state.family, a)
-    asked = family_lib.Asked(a, jnp.zeros(count, jnp.int32), x)
+    asked = family_lib.best(config.family, state.family, a)
     env, which = families.environment(own, world, asked), jnp.arange(count, dtype=jnp.int32)
     steps = families.longest(config, own.shown)
     trace = evaluate.run(env, nets, state, jnp.zeros(count), steps, which)
@@ -139,7 +138,7 @@ def _perform(
         constraint,
         (world.body, world.shapes),
     )
-    varied = variation.unflatten(x, layout.own.nv)
+    varied = variation.unflatten(asked.x, layout.own.nv)
     shown = jax.vmap(functools.partial(variation.displace, layout))(world.motion, varied)
     at = lambda one, phase: motion.sample(layout, one, phase)[0]  # noqa: E731
     return Performances(

@@ -24,7 +24,7 @@ from jaxskills.env import style as style_lib
 from jaxskills.env import tracking as tracking_lib
 from jaxskills.env.measure import Moment
 from jaxskills.env.task import Task
-from jaxskills.env.variants import Variant, Variants, pick
+from jaxskills.env.variants import Fed, Variant, Variants, pick
 from jaxskills.errors import UserError
 from jaxskills.kinematics import Bodies
 from jaxskills.motion import CONTROL_DT, sample
@@ -188,9 +188,8 @@ def make(
         whole, error = pose.minus(layout, ref_qpos, qpos), ref_qvel - qvel
         return _Seen(bodies, reference, mine(whole), mine(error), (both[0], both[1]), whole)
 
-    def natural_speed(state: EnvState) -> jax.Array:
-        own = pick(variants, state.variant)
-        speed = variation_lib.rate(own.motion, own.variation, state.phase)
+    def pace(state: EnvState, made: Variant | Fed) -> jax.Array:
+        speed = variation_lib.rate(made.motion, made.variation, state.phase)
         return jnp.where(state.phase < over, speed, 1.0)
 
     def features(state: EnvState, seen: _Seen) -> jax.Array:
@@ -199,7 +198,7 @@ def make(
             sim = state.sim
             parts.append(scene.observe(sim.qpos, sim.qvel, seen.whole, seen.bodies, axis))
         if config.time_warp:
-            parts.append(jnp.log(natural_speed(state))[None])
+            parts.append(jnp.log(pace(state, pick(variants, state.variant)))[None])
         if task is not None and state.known is not None:
             parts.append(task.observe(state.known, pick(variants, state.variant).task))
         return jnp.concatenate(parts)
@@ -239,11 +238,11 @@ def make(
         """Returns how much phase the step takes, and how much the reference would."""
         if not config.time_warp:
             return jnp.float32(1.0), jnp.float32(1.0)
-        natural = natural_speed(state)
-        chosen = jnp.log(natural) + config.warp_scale * action[-1]
+        own = pick(variants, state.variant)
+        chosen = jnp.log(pace(state, own.fed or own)) + config.warp_scale * action[-1]
         chosen = jnp.exp(jnp.clip(chosen, *config.warp_limits))
         # Who could hurry through the hold would end in the air, and never land.
-        return jnp.where(state.phase < over, chosen, 1.0), natural
+        return jnp.where(state.phase < over, chosen, 1.0), pace(state, own)
 
     def around(state: EnvState, dphase: jax.Array) -> tuple[SimState, list[jax.Array]]:
         """Returns the simulation with its objects in place, and what they and holds are told."""
@@ -262,9 +261,11 @@ def make(
     ) -> tuple[SimState, jax.Array]:
         base, speed = neutral, jnp.zeros(layout.nv)
         if config.feedforward:
-            own, (chosen, natural) = pick(variants, state.variant), taken
-            base, ahead = sample(layout, own.motion, state.phase + config.lead * chosen)
-            speed = ahead * (chosen / natural) if config.velocity_feedforward else speed
+            own, chosen = pick(variants, state.variant), taken[0]
+            made = own.fed or own
+            base, ahead = sample(layout, made.motion, state.phase + config.lead * chosen)
+            ahead *= chosen / pace(state, made) if config.time_warp else 1.0
+            speed = ahead if config.velocity_feedforward else speed
         push = action[: len(dofs)]
         target = pose.plus(layout, base, jnp.zeros(layout.nv).at[dofs].set(push))
         sim, told = around(state, taken[0])

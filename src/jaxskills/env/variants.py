@@ -24,6 +24,14 @@ from jaxskills.variation import Variation
 
 
 @struct.dataclass
+class Fed:
+    """A motion that is fed forward in the place of the reference."""
+
+    motion: Motion
+    variation: Variation  # what made it of the clip
+
+
+@struct.dataclass
 class Variant:
     """One variant, or W of them stacked."""
 
@@ -33,6 +41,7 @@ class Variant:
     shapes: Shapes  # what can touch the ground
     task: jax.Array  # [P] the task parameter, normalised; P is 0 for a skill
     holds: Holds | None = None  # what hands may hold
+    fed: Fed | None = None  # what is fed forward, if it is not the reference itself
 
 
 @struct.dataclass

@@ -4,8 +4,9 @@
 At first only the reference itself is learnt (pi_0 of FS 5.3), until the policy gets through it
 reliably. A policy that only ever imitated the reference falls when it is to imitate its own best
 performance of it, which lags behind the targets that it feeds forward. All motions of a family are
-such performances, so they are imitated too as soon as half get through. From then on each update asks for a batch of task parameters, each with the motion that is
-known best for it, and takes in the episodes that come of them.
+such performances, so they are imitated too as soon as half get through, and what is fed forward is
+less by what the reference lags. From then on each update asks for a batch of task parameters, each
+with the motion that is known best for it, and takes in the episodes that come of them.
 """
 
 import dataclasses
@@ -97,6 +98,7 @@ class Asked:
     a: jax.Array  # [W, P]
     region: jax.Array  # [W] int32
     x: jax.Array  # [W, M] variations to imitate, flattened
+    fed: jax.Array  # [W, M] variations that are fed forward
 
 
 @struct.dataclass
@@ -129,7 +131,7 @@ def first(config: FamilyConfig, reference: jax.Array, size: int) -> Asked:
     """Returns what is asked for at the beginning: the reference alone. Arguments as of `init`."""
     batch = config.curriculum.batch
     itself = jnp.zeros((batch, size))
-    return Asked(jnp.tile(reference, (batch, 1)), jnp.zeros(batch, jnp.int32), itself)
+    return Asked(jnp.tile(reference, (batch, 1)), jnp.zeros(batch, jnp.int32), itself, itself)
 
 
 def init(config: FamilyConfig, reference: jax.Array, size: int, key: jax.Array) -> Family:
@@ -210,14 +212,12 @@ def update(
 
 def _ask_for_reference(config: FamilyConfig, family: Family) -> Family:
     """Returns the family with a next batch at the reference, for part of it as performed so far."""
-    asked, how = family.asked, config.parameterization
-    x = elites_lib.proxy(family.elites, asked.a, how.neighbours, how.sigma, how.ridge)
+    asked, x = family.asked, performed(config, family)
     places = jnp.arange(asked.a.shape[0]) + 0.5
     own = (places * config.base_own) % 1.0 >= 1.0 - config.base_own  # evenly among them
-    own &= (family.base.success >= _PERFORMED) & config.vary
-    return dataclasses.replace(
-        family, asked=dataclasses.replace(asked, x=jnp.where(own[:, None], x, 0.0))
-    )
+    own &= family.base.success >= _PERFORMED
+    asked = dataclasses.replace(asked, x=jnp.where(own[:, None], x, 0.0))  # without feeding x
+    return dataclasses.replace(family, asked=asked)
 
 
 def _ask(
@@ -237,11 +237,25 @@ def _ask(
         )
     else:
         x = jnp.zeros_like(family.asked.x)
-    return dataclasses.replace(family, curriculum=curriculum, asked=Asked(a, region, x))
+    asked = Asked(a, region, x, x - performed(config, family))
+    return dataclasses.replace(family, curriculum=curriculum, asked=asked)
 
 
-def best(config: FamilyConfig, family: Family, a: jax.Array) -> jax.Array:
-    """Returns the motions `[B, M]` that are known best for task parameters `a [B, P]`.
+def performed(config: FamilyConfig, family: Family) -> jax.Array:
+    """Returns the variation `[M]` that the reference becomes when it is performed.
+
+    Servos lag behind their targets, or reach less far, so what is performed is never what is fed
+    forward. A variation is a performance: feeding it forward would make it smaller, later and
+    slower once more. Without what the performance of the reference itself differs by, the targets
+    are about those that it was performed with.
+    """
+    how, reference = config.parameterization, family.curriculum.reference
+    x = elites_lib.proxy(family.elites, reference, how.neighbours, how.sigma, how.ridge)
+    return jnp.where(config.vary, x, 0.0)
+
+
+def best(config: FamilyConfig, family: Family, a: jax.Array) -> Asked:
+    """Returns the motions that are known best for task parameters `a [B, P]`, as asked for.
 
     Those of the network once it is trusted, until then of the proxy (FS 5.3), without chance; the
     reference itself as long as nothing else was asked for.
@@ -250,7 +264,10 @@ def best(config: FamilyConfig, family: Family, a: jax.Array) -> jax.Array:
     likely = elites_lib.proxy(elites, a, how.neighbours, how.sigma, how.ridge)
     sure = parameterization_lib.trusted(how, network)
     x = jnp.where(sure, parameterization_lib.apply(network, a), likely)
-    return jnp.where(family.base.learnt & config.vary, x, 0.0)
+    x, lag = (
+        jnp.where(family.base.learnt & config.vary, v, 0.0) for v in (x, performed(config, family))
+    )
+    return Asked(a, jnp.zeros(a.shape[0], jnp.int32), x, x - lag)
 
 
 def caution(config: FamilyConfig, family: Family) -> jax.Array:
