@@ -68,6 +68,7 @@ def test_performances_of_the_reference_are_imitated_once_half_get_through():
     for success, expected in [(0.4, none), (0.6, half)]:
         state, _ = UPDATE(_begin(), _results([0.4], success=success), jax.random.key(0))
         np.testing.assert_allclose(state.asked.x, expected, atol=1e-5)
+        assert not state.asked.fed.any()
         np.testing.assert_array_equal(state.asked.a, np.full((8, 1), 0.4, np.float32))
     without = dataclasses.replace(CONFIG, vary=False)
     state, _ = family.update(without, _begin(), _results([0.4]), jax.random.key(0))
@@ -92,6 +93,11 @@ def test_it_asks_around_its_elites_for_their_motion():
     # An elite's motion is its parameter, throughout.
     motion = np.asarray(state.asked.x)
     np.testing.assert_allclose(motion, np.tile(asked[:, None], motion.shape[1]), atol=0.03)
+    # What is fed forward is that without the performance of the reference, which is 0.4.
+    np.testing.assert_allclose(state.asked.fed, motion - 0.4, atol=1e-3)
+    best = family.best(CONFIG, state, jnp.array([[0.5], [0.4]]))
+    np.testing.assert_allclose(best.x[:, 0], [0.5, 0.4], atol=0.03)
+    np.testing.assert_allclose(best.fed, best.x - 0.4, atol=1e-3)
 
 
 def test_new_elites_count_for_whoever_was_asked():

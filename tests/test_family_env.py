@@ -158,3 +158,30 @@ def test_the_target_is_ahead_by_the_chosen_speed(who: Character):
         reached.append((float(target[11]), float(after.sim.qpos[11])))
     (near, a), (_, b), (far, c) = reached
     assert (far - near) * (c - a) > 0.0 and min(a, c) < b < max(a, c)
+
+
+def test_another_motion_can_be_fed_forward(who: Character):
+    """Bent by 0.1 rad and faster, it moves servos as that action does on the reference."""
+    walk = tiny.make_motion(who, tiny.walking(), True)
+    engine, model = tiny.make_physics(who)
+    itself = variation.zeros(4, who.layout.nv)
+    made = Variation(itself.d.at[:, 9].set(0.1), itself.tau + 0.3)
+    walk = variation.displace(who.layout, walk, itself)  # with velocities from the poses
+    plain = variants.row(who, walk, itself, jnp.zeros(0))
+    ahead = variants.Fed(variation.displace(who.layout, walk, made), made)
+    found = []
+    for row, action in (
+        (plain, STILL.at[3].set(0.1).at[5].set(0.2)),  # of 1.5: `EnvConfig.warp_scale`
+        (dataclasses.replace(plain, fed=ahead), STILL),
+        (plain, STILL),
+    ):
+        only = variants.stack([row], model)
+        env = core.make(who, only, engine, bounds.make(who, WIDE), TRACKING)
+        start = env.start(jnp.float32(4.0))
+        shown = motion.sample(who.layout, walk, 4.0)[0]  # but for the height: soles off the floor
+        np.testing.assert_array_equal(start.sim.qpos[3:], shown[3:])
+        after, outcome = jit(env.step)(start, action)
+        found.append((after.sim.qpos, after.phase, outcome.rate, outcome.obs))
+    for acted, fed, still in zip(*found, strict=True):
+        np.testing.assert_allclose(acted, fed, atol=1e-4)
+        assert np.abs(fed - still).max() > 1e-3
