@@ -61,20 +61,6 @@ def test_only_the_reference_is_asked_for_until_it_is_learnt():
     assert int(state.episodes) == 30 * len(rewards)
 
 
-def test_performances_of_the_reference_are_imitated_once_half_get_through():
-    """An elite's motion is 0.4 throughout; the reference's is 0."""
-    none, half = np.zeros((8, SIZE)), np.zeros((8, SIZE))
-    half[1::2] = 0.4
-    for success, expected in [(0.4, none), (0.6, half)]:
-        state, _ = UPDATE(_begin(), _results([0.4], success=success), jax.random.key(0))
-        np.testing.assert_allclose(state.asked.x, expected, atol=1e-5)
-        assert not state.asked.fed.any()
-        np.testing.assert_array_equal(state.asked.a, np.full((8, 1), 0.4, np.float32))
-    without = dataclasses.replace(CONFIG, vary=False)
-    state, _ = family.update(without, _begin(), _results([0.4]), jax.random.key(0))
-    assert not state.asked.x.any()
-
-
 def test_the_reference_is_not_learnt_while_episodes_fail():
     state = _begin()
     for i in range(20):

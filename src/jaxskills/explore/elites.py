@@ -16,6 +16,9 @@ from flax import struct
 from jaxskills.errors import UserError
 
 
+_UNIT = 1.1  # of distances in the density of elites, in their radius
+
+
 @dataclasses.dataclass(frozen=True)
 class EliteConfig:
     """Who becomes an elite."""
@@ -116,10 +119,11 @@ def insert(
 def density(config: EliteConfig, elites: Elites, a: jax.Array) -> jax.Array:
     """Returns how densely elites lie around `a [..., P]`, `[...]` (FS eq. 15).
 
-    The sum of exp(-|a_k - a|^2 / r^2) over the elites: FS leaves the unit open, so a lone elite
-    makes 1 where it is, 0.8 at 0.47 r and 0.2 at 1.27 r.
+    The sum of exp(-|a_k - a|^2 / (1.1 r)^2) over the elites: FS leaves the unit open. A lone elite
+    makes 1 where it is, 0.8 at 0.52 r and 0.2 at 1.4 r. With r as the unit two elites 1.95 r apart,
+    between which no third fits, would make 0.77 there: less than D for ever.
     """
-    near = jnp.exp(-_distance(elites.a.T, a) / config.radius**2)
+    near = jnp.exp(-_distance(elites.a.T, a) / (_UNIT * config.radius) ** 2)
     return jnp.sum(jnp.where(elites.used, near, 0.0), axis=-1)
 
 

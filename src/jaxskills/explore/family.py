@@ -2,11 +2,8 @@
 """A family of motions as it is learnt: elites, parameterisation, curriculum, and what comes next.
 
 At first only the reference itself is learnt (pi_0 of FS 5.3), until the policy gets through it
-reliably. A policy that only ever imitated the reference falls when it is to imitate its own best
-performance of it, which lags behind the targets that it feeds forward. All motions of a family are
-such performances, so they are imitated too as soon as half get through, and what is fed forward is
-less by what the reference lags. From then on each update asks for a batch of task parameters, each
-with the motion that is known best for it, and takes in the episodes that come of them.
+reliably. From then on each update asks for a batch of task parameters, each with the motion that is
+known best for it, and takes in the episodes that come of them.
 """
 
 import dataclasses
@@ -45,10 +42,6 @@ WATCHED = (
 )
 
 
-# From that share of episodes that get through on, their best are imitated.
-_PERFORMED = 0.5
-
-
 @dataclasses.dataclass(frozen=True)
 class FamilyConfig:
     """How a family is learnt."""
@@ -61,7 +54,6 @@ class FamilyConfig:
     # The reference itself is learnt when that share of the episodes get through it, and the reward
     # has not grown by so much for some updates.
     base_late: float = 0.7  # share of late starts until then, anywhere
-    base_own: float = 0.5  # share that imitates the best performances of it
     base_success: float = 0.8
     base_growth: float = 0.02  # share of the reward
     base_patience: int = 3  # updates
@@ -203,21 +195,9 @@ def update(
         family.episodes + jnp.uint32(results.begun),
     )
     family = jax.lax.cond(
-        base.learnt,
-        lambda: _ask(config, keeping, family, ask_key),
-        lambda: _ask_for_reference(config, family),
+        base.learnt, lambda: _ask(config, keeping, family, ask_key), lambda: family
     )
     return family, watched(config, family, results, asked, entered, counted)
-
-
-def _ask_for_reference(config: FamilyConfig, family: Family) -> Family:
-    """Returns the family with a next batch at the reference, for part of it as performed so far."""
-    asked, x = family.asked, performed(config, family)
-    places = jnp.arange(asked.a.shape[0]) + 0.5
-    own = (places * config.base_own) % 1.0 >= 1.0 - config.base_own  # evenly among them
-    own &= family.base.success >= _PERFORMED
-    asked = dataclasses.replace(asked, x=jnp.where(own[:, None], x, 0.0))  # without feeding x
-    return dataclasses.replace(family, asked=asked)
 
 
 def _ask(
@@ -331,7 +311,7 @@ def validate(config: FamilyConfig) -> None:
     """
     if not 1 <= config.episodes <= 100:
         raise UserError(f"family.episodes is {config.episodes}: give 1 to 100")
-    for name in ("late", "base_late", "base_own", "base_success", "base_growth", "base_memory"):
+    for name in ("late", "base_late", "base_success", "base_growth", "base_memory"):
         if not 0 <= getattr(config, name) < 1:
             raise UserError(f"family.{name} is {getattr(config, name)}: give 0 <= {name} < 1")
     if not 0 < config.refining_kl <= 1:
