@@ -224,7 +224,7 @@ def test_inserting_is_traced_once_and_writes_in_place():
 
 def test_density_of_a_lone_elite():
     found = _holding(SMALL, (0.5, 0.5))
-    a = 0.5 + jnp.array([[0.0], [0.0472], [-0.1269], [0.1], [0.5]])
+    a = 0.5 + jnp.array([[0.0], [0.0520], [-0.1396], [0.11], [0.5]])
     density = _density(SMALL, found, a)
     np.testing.assert_allclose(density, [1.0, 0.8, 0.2, np.exp(-1.0), 0.0], atol=1e-3)
 
@@ -236,22 +236,35 @@ def test_density_as_by_a_plain_loop(parameters: int):
     places = random.uniform(size=(3, 5, parameters)).astype(np.float32)
     members = np.array(list(_members(found)))[:, 1:]
     expected = [
-        [sum(np.exp(-np.sum((m - a) ** 2) / 0.04) for m in members) for a in row] for row in places
+        [sum(np.exp(-np.sum((m - a) ** 2) / 0.22**2) for m in members) for a in row]
+        for row in places
     ]
     np.testing.assert_allclose(_density(config, found, places), expected, rtol=1e-4)
 
 
 def test_explored_ratio():
-    """One elite at 0.5 makes 2 x 0.0472 of the line dense; a fine grid makes all of it."""
+    """One elite at 0.5 makes 2 x 0.0520 of the line dense; a fine grid makes all of it."""
     empty = elites_lib.init(SMALL, 1, 2)
     assert float(_explored_ratio(SMALL, empty)) == 0.0
     one = _holding(SMALL, (0.5, 0.5))
-    assert float(_explored_ratio(SMALL, one)) == pytest.approx(0.0945, abs=2e-3)
-    assert float(_explored_ratio(SMALL, one, 0.2)) == pytest.approx(0.2537, abs=2e-3)
+    assert float(_explored_ratio(SMALL, one)) == pytest.approx(0.1039, abs=2e-3)
+    assert float(_explored_ratio(SMALL, one, 0.2)) == pytest.approx(0.2791, abs=2e-3)
     grid = np.stack(np.meshgrid(*[np.arange(11) * 0.101] * 2), -1).reshape(-1, 2)
     new = _episodes(grid, np.full(len(grid), 0.5))
     full = Elites(new.a, new.x, new.fitness, new.valid)
     assert float(_explored_ratio(SMALL, full)) == 1.0
+
+
+@pytest.mark.parametrize(("apart", "dense", "fits"), [(0.199, 1, 0), (0.209, 1, 1), (0.23, 0, 1)])
+def test_what_is_not_dense_between_two_elites_has_room_for_a_third(
+    apart: float, dense: bool, fits: bool
+):
+    """Or else a line could never be explored completely. The third is fit enough to enter."""
+    pair = _holding(SMALL, (0.4, 0.5), (0.4 + apart, 0.5))
+    middle = np.array([[0.4 + apart / 2]])
+    assert bool(_density(SMALL, pair, middle)[0] > 0.8) == dense
+    _, entered, _ = elites_lib.insert(SMALL, pair, _episodes(middle, np.array([0.3])))
+    assert bool(entered[0]) == fits
 
 
 @pytest.mark.parametrize("parameters", [1, 2, 3, 4])

@@ -15,7 +15,6 @@ from flax import struct
 
 from jaxskills.errors import UserError
 
-
 _UNIT = 1.1  # of distances in the density of elites, in their radius
 
 
