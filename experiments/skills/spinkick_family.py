@@ -35,7 +35,7 @@ RECIPE = Recipe(
         )
     ),
     # Updates of whole episodes, fewer and larger: with short ones the policy imitates worse and
-    # worse while it explores. With steps as large it would get through less of what it knows.
+    # worse while it explores. While refining steps are smaller, to perform well what is known.
     config=for_family(
         TrainConfig(
             horizon=48,
