@@ -126,7 +126,6 @@ def test_no_more_rows_than_can_be_filled():
         ("episodes", 0.5),
         ("late", 1.0),
         ("base_success", -0.1),
-        ("base_own", 1.0),
         ("refining_kl", 0.0),
     ],
 )
