@@ -107,7 +107,10 @@ def environment(own: Parts, world: World, asked: family_lib.Asked) -> core.Envir
     displace = jax.jit(jax.vmap(functools.partial(variation_lib.displace, layout)))
     motions = displace(world.motion, made)  # on the host too, and at once
     ahead = variants.Fed(displace(world.motion, fed), fed)
-    rows = variants.Variant(motions, made, world.body, world.shapes, asked.a, world.holds, ahead)
+    first = world.motion.qpos[:, 0], world.motion.qvel[:, 0]
+    rows = variants.Variant(
+        motions, made, world.body, world.shapes, asked.a, world.holds, ahead, first
+    )
     both = variants.Variants(rows, world.model, asked.a.shape[0], length, own.shown.loop)
     config = env_config(own.config, own.shown)
     return core.make(own.character, both, own.engine, own.bounds, config, task=own.task)

@@ -24,7 +24,7 @@ from jaxskills.env import style as style_lib
 from jaxskills.env import tracking as tracking_lib
 from jaxskills.env.measure import Moment
 from jaxskills.env.task import Task
-from jaxskills.env.variants import Fed, Variant, Variants, pick
+from jaxskills.env.variants import Fed, Variant, Variants, begin, pick
 from jaxskills.errors import UserError
 from jaxskills.kinematics import Bodies
 from jaxskills.motion import CONTROL_DT, sample
@@ -216,7 +216,7 @@ def make(
 
     def start(phase: jax.Array, variant: jax.Array | int = 0) -> EnvState:
         variant = jnp.asarray(variant, jnp.int32)
-        return place(phase, *sample(layout, pick(variants, variant).motion, phase), variant)
+        return place(phase, *begin(layout, pick(variants, variant), phase), variant)
 
     def place(
         phase: jax.Array, qpos: jax.Array, qvel: jax.Array, variant: jax.Array | int = 0

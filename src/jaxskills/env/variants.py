@@ -19,7 +19,8 @@ from jaxskills.env import holds
 from jaxskills.env.holds import Holds
 from jaxskills.ground import Shapes
 from jaxskills.kinematics import BodyParams
-from jaxskills.motion import Motion
+from jaxskills.motion import Motion, sample
+from jaxskills.pose import Layout
 from jaxskills.variation import Variation
 
 
@@ -42,6 +43,8 @@ class Variant:
     task: jax.Array  # [P] the task parameter, normalised; P is 0 for a skill
     holds: Holds | None = None  # what hands may hold
     fed: Fed | None = None  # what is fed forward, if it is not the reference itself
+    # (qpos [nq], qvel [nv]) at phase 0, if the reference does not say so
+    first: tuple[jax.Array, jax.Array] | None = None
 
 
 @struct.dataclass
@@ -85,6 +88,17 @@ def stack(rows: Sequence[Variant], model: Any) -> Variants:
     stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *rows)
     first = rows[0].motion
     return Variants(stacked, model, len(rows), float(first.length), first.loop)
+
+
+def begin(layout: Layout, own: Variant, phase: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns the state `qpos [nq]`, `qvel [nv]` in which an episode begins at `phase []`."""
+    there = sample(layout, own.motion, phase)
+    if own.first is None:
+        return there
+    qpos, qvel = (
+        jnp.where(phase > 0.0, x, first) for x, first in zip(there, own.first, strict=True)
+    )
+    return qpos, qvel
 
 
 def pick(variants: Variants, index: jax.Array) -> Variant:
