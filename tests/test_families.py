@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tiny
 
-from jaxskills import checkpoint, families
+from jaxskills import checkpoint, families, motion
 from jaxskills.compilation import jit
 from jaxskills.env import conditions, measure
 from jaxskills.env.core import EnvConfig
@@ -125,6 +125,19 @@ def test_a_world_for_each_parameter(made: Trainer, begin: TrainState):
     np.testing.assert_allclose(heights[0], np.asarray(made.motion.qpos[:, 2]), atol=1e-6)
     np.testing.assert_allclose(heights[1] - heights[0], 0.1, atol=0.02)
     np.testing.assert_allclose(heights[2] - heights[0], -0.1, atol=0.02)
+
+
+def test_performances_begin_as_the_reference_does(made: Trainer, begin: TrainState):
+    """Whatever their motion does in its first knots, whose slope is no speed to begin with."""
+    assert made.world is not None and begin.family is not None
+    world, own = made.world(begin), families.parts(made.config, SPEC)
+    knots = jnp.full((own.knots, own.character.layout.own.nv + 1), 0.1).at[0].set(0.0)
+    x = jnp.tile(knots.reshape(-1), (4, 1))
+    env = families.environment(own, world, dataclasses.replace(begin.family.asked, x=x, fed=x))
+    for phase, same in ((0.0, True), (1.0, False)):
+        state = env.start(jnp.float32(phase), jnp.int32(1))
+        qvel = motion.sample(own.character.layout, made.motion, phase)[1]
+        assert np.allclose(state.sim.qvel, qvel, atol=1e-5) == same
 
 
 @pytest.mark.parametrize(

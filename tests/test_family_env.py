@@ -77,6 +77,18 @@ def test_each_environment_has_its_own_reference(family: Environment):
     assert (int(low.variant), int(high.variant)) == (0, 1)
 
 
+def test_where_an_episode_begins_can_be_given(who: Character):
+    walk = tiny.make_motion(who, tiny.walking(), True)
+    itself = variation.zeros(4, who.layout.nv)
+    plain = variants.row(who, walk, itself, jnp.zeros(0))
+    first = motion.sample(who.layout, walk, 9.0)
+    given = dataclasses.replace(plain, first=first)
+    for phase, row, shown in ((0.0, plain, 0.0), (0.0, given, 9.0), (4.0, given, 4.0)):
+        there = variants.begin(who.layout, row, jnp.float32(phase))
+        for value, expected in zip(there, motion.sample(who.layout, walk, shown), strict=True):
+            np.testing.assert_allclose(value, expected, atol=1e-6)
+
+
 def test_the_policy_chooses_how_fast_phase_goes_by(family: Environment):
     assert family.action_size == 6
     for variant, push, expected in (
