@@ -211,13 +211,10 @@ def _ask(
         config.curriculum, family.curriculum, density, value, renew_key
     )
     a, region = curriculum_lib.draw(config.curriculum, curriculum, density, draw_key)
-    if config.vary:
-        x = parameterization_lib.draw(
-            config.parameterization, family.network, family.elites, a, motion_key
-        )
-    else:
-        x = jnp.zeros_like(family.asked.x)
-    asked = Asked(a, region, x, x - performed(config, family))
+    x = parameterization_lib.draw(
+        config.parameterization, family.network, family.elites, a, motion_key
+    )
+    asked = _asked(config, family, a, region, x)
     return dataclasses.replace(family, curriculum=curriculum, asked=asked)
 
 
@@ -230,8 +227,7 @@ def performed(config: FamilyConfig, family: Family) -> jax.Array:
     are about those that it was performed with.
     """
     how, reference = config.parameterization, family.curriculum.reference
-    x = elites_lib.proxy(family.elites, reference, how.neighbours, how.sigma, how.ridge)
-    return jnp.where(config.vary, x, 0.0)
+    return elites_lib.proxy(family.elites, reference, how.neighbours, how.sigma, how.ridge)
 
 
 def best(config: FamilyConfig, family: Family, a: jax.Array) -> Asked:
@@ -244,10 +240,17 @@ def best(config: FamilyConfig, family: Family, a: jax.Array) -> Asked:
     likely = elites_lib.proxy(elites, a, how.neighbours, how.sigma, how.ridge)
     sure = parameterization_lib.trusted(how, network)
     x = jnp.where(sure, parameterization_lib.apply(network, a), likely)
+    return _asked(config, family, a, jnp.zeros(a.shape[0], jnp.int32), x)
+
+
+def _asked(
+    config: FamilyConfig, family: Family, a: jax.Array, region: jax.Array, x: jax.Array
+) -> Asked:
+    """Returns what is asked for with the motions `x [B, M]`, or with the reference alone."""
     x, lag = (
         jnp.where(family.base.learnt & config.vary, v, 0.0) for v in (x, performed(config, family))
     )
-    return Asked(a, jnp.zeros(a.shape[0], jnp.int32), x, x - lag)
+    return Asked(a, region, x, x - lag)
 
 
 def caution(config: FamilyConfig, family: Family) -> jax.Array:
