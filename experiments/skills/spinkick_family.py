@@ -7,10 +7,8 @@ this clip, whose kick is 0.3 m higher than the paper's, for feet 2.7 m high.
 
 from jaxskills.env import measure
 from jaxskills.env.task import Parameter, TaskSpec
-from jaxskills.explore.family import FamilyConfig
-from jaxskills.learn.ppo import PPOConfig
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig, for_family
+from jaxskills.trainer import for_family
 
 RECIPE = Recipe(
     name="spinkick_family",
@@ -34,13 +32,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    # Updates of whole episodes, fewer and larger: with short ones the policy imitates worse and
-    # worse while it explores. While refining steps are smaller, to perform well what is known.
-    config=for_family(
-        TrainConfig(
-            horizon=48,
-            ppo=PPOConfig(policy_lr=1e-4, target_kl=0.08),
-            family=FamilyConfig(refining_kl=0.25),
-        )
-    ),
+    config=for_family(),
 )
