@@ -34,7 +34,6 @@ SAMPLES = {
     "swing": 20_000_000,
     "wall_jump": 20_000_000,
 }
-_HOLD = 15  # control steps in which the last pose is held
 
 
 def main() -> None:
@@ -75,7 +74,7 @@ def steps(name: str) -> int:
     """Returns how many control steps an episode of a family has that is not cut short."""
     config = commands.settings(recipes.find(name))
     motion = trainer.reference(config, character.load(config.character))
-    return math.ceil(float(motion.length)) + _HOLD
+    return math.ceil(float(motion.length) + config.env.hold)
 
 
 if __name__ == "__main__":

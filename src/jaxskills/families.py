@@ -300,12 +300,12 @@ def env_config(config: TrainConfig, shown: Motion) -> core.EnvConfig:
 def longest(config: TrainConfig, shown: Motion) -> int:
     """Returns how many control steps an episode has at most."""
     slow = _SLOWEST if config.env.time_warp else 1.0
-    return math.ceil(slow * float(shown.length)) + 16
+    return math.ceil(slow * float(shown.length) + config.env.hold) + 1
 
 
 def chunk_count(config: TrainConfig, shown: Motion) -> int:
     """Returns how many times policy and value function are updated in one update of a family."""
-    steps = config.family.episodes * (float(shown.length) + 15)
+    steps = config.family.episodes * (float(shown.length) + config.env.hold)
     return math.ceil(steps / config.horizon)
 
 

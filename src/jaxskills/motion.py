@@ -40,7 +40,7 @@ class Motion:
 class MotionConfig:
     """How a clip's poses become a reference."""
 
-    loop: bool = True  # off: a clip that loops is done once, and its last pose is held
+    loop: bool = True  # off: a clip that loops is done once
     close_loop: float = 0.15  # s on either side of the seam over which a loop's gap is spread
     smooth_velocity: float = 0.03  # s, width of the Gaussian that calms spiking velocities
     ballistic: bool = False  # velocities in flight are those of a thrown body, see `flight`

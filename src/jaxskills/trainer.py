@@ -125,11 +125,11 @@ class Trainer(NamedTuple):
 
 def reference(config: TrainConfig, character: Character) -> Motion:
     """Returns the clip of a configuration as a motion of the character, where it stands."""
-    clip = clip_lib.cut(clip_lib.load(config.clip), config.motion.start, config.motion.end)
+    clip = clip_lib.load(config.clip)
+    clip = clip if config.motion.loop else clip_lib.once(clip)
+    clip = clip_lib.cut(clip, config.motion.start, config.motion.end)
     qpos = retarget.retarget(character, clip)
     made = motion_lib.from_qpos(character.model, qpos, clip.times, clip.loop, config.motion)
-    # After the gap at its ends is closed: clips that loop tend to have a jump there.
-    made = dataclasses.replace(made, loop=clip.loop and config.motion.loop)
     made = flight.ballistic(character, made) if config.motion.ballistic else made
     return levels.raised(character, made)
 

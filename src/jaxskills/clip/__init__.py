@@ -8,10 +8,10 @@ import numpy as np
 
 from jaxskills import paths
 from jaxskills.clip import bvh, deepmimic, keyframes
-from jaxskills.clip.data import Clip, Skeleton, build, cut
+from jaxskills.clip.data import Clip, Skeleton, build, cut, once
 from jaxskills.errors import UserError, unknown
 
-__all__ = ["Clip", "Skeleton", "available", "build", "cut", "load", "save"]
+__all__ = ["Clip", "Skeleton", "available", "build", "cut", "load", "once", "save"]
 
 _PREFIX = "humanoid3d_"
 

@@ -135,6 +135,14 @@ def cut(clip: Clip, start: float, end: float | None) -> Clip:
     )
 
 
+def once(clip: Clip) -> Clip:
+    """Returns a clip that does not loop: one that did without its last frame, where it starts anew.
+
+    It looks much like the first one, so clips tend to have a jump there.
+    """
+    return cut(clip, 0.0, float(clip.times[-2])) if clip.loop else clip
+
+
 def _check(
     source: str,
     times: np.ndarray,

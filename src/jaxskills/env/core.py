@@ -33,10 +33,7 @@ from jaxskills.physics import Physics, SimState, servo
 # How an episode may end besides leaving a named bound.
 OTHER_ENDINGS = ("ground contact", "fall", "diverged", "time limit")
 
-# A start is lifted this far out of the floor; an episode lasts this much longer than its motion,
-# whose last pose is held.
-_LIFT_MARGIN = 1e-3  # m
-_HOLD = 15.0  # control frames
+_LIFT_MARGIN = 1e-3  # m, a start is lifted this far out of the floor
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +42,7 @@ class EnvConfig:
 
     substeps: int = 4  # physics steps in a control step of 1/30 s: 120 Hz
     seconds: float = 20.0  # longest episode, SB Table 1
+    hold: float = 15.0  # control frames for which the last pose of a motion without loop is held
     lead: float = 1.0  # control frames the feed-forward target is ahead of the state, FS eq. 4
     # The servos damp towards the reference's speed, not towards rest: otherwise they lag by kd/kp,
     # 0.1 s for DeepMimic's gains, and a run leaves its bounds within 0.1 s by its knees alone.
@@ -174,7 +172,7 @@ def make(
     scene = objects.scene(character, length)
     mine = lambda x: x if scene is None else x[: layout.own.nv]  # noqa: E731  no objects
     over = math.inf if loop and not config.once else length  # from there on a pose is held
-    end = over + _HOLD
+    end = over + config.hold
     endings = (*bounds.names, *OTHER_ENDINGS)
 
     def look(state: EnvState) -> _Seen:
@@ -396,5 +394,7 @@ def validate(config: EnvConfig) -> None:
     tracking_lib.validate(config.tracking)
     if not config.warp_limits[0] <= 0.0 <= config.warp_limits[1]:
         raise UserError(f"env.warp_limits is {config.warp_limits}: give low <= 0 <= high")
+    if not 3 <= config.hold <= 3000:
+        raise UserError(f"env.hold is {config.hold}: give 3 to 3000 control frames")
     if not -30 <= config.lead <= 30:
         raise UserError(f"env.lead is {config.lead}: give -30 to 30 control frames")
