@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clip files: the numbers that come out, what is absorbed, what is refused and how it is said."""
 
+import dataclasses
 import importlib.util
 import json
 from pathlib import Path
@@ -396,3 +397,14 @@ def test_a_part_of_a_clip(tmp_path: Path):
         UserError, match="motion.start 0.25 to motion.end 0.3: clip .* has 1 frames"
     ):
         clip.cut(whole, 0.25, 0.3)
+
+
+def test_a_loop_done_once(tmp_path: Path):
+    """Without the frame with which it starts anew; what does not loop stays as it is."""
+    frames = [frame(0.1, c1=[i, 1.0, 0.0]) for i in range(4)]
+    whole = clip.load(write(tmp_path / "four.txt", frames))
+    single = clip.once(dataclasses.replace(whole, loop=True))
+    assert not single.loop and len(single.times) == len(whole.times) - 1
+    np.testing.assert_array_equal(single.root_pos, whole.root_pos[:-1])
+    once = dataclasses.replace(whole, loop=False)
+    assert clip.once(once) is once

@@ -505,6 +505,7 @@ def test_the_report_says_which_torque_was_applied(walker: Running):
         (EnvConfig(substeps=101), "env.substeps is 101: give 1 to 100 (20 is 600 Hz)"),
         (EnvConfig(seconds=0.0), "env.seconds is 0.0: give 1/30 to 3600 s"),
         (EnvConfig(seconds=float("nan")), "env.seconds is nan: give 1/30 to 3600 s"),
+        (EnvConfig(hold=1.0), "env.hold is 1.0: give 3 to 3000 control frames"),
         (EnvConfig(lead=31.0), "env.lead is 31.0: give -30 to 30 control frames"),
     ],
 )

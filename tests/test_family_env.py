@@ -114,6 +114,15 @@ def test_nobody_hurries_through_the_hold_after_the_end(family: Environment):
     assert float(family.observe(after)[-3]) == 0.0  # log of the speed
 
 
+def test_how_long_the_last_pose_is_held(who: Character, stand: Motion):
+    for hold in (3.0, 9.0):
+        env = _family(who, stand, dataclasses.replace(TRACKING, hold=hold))
+        assert env.end == 30.0 + hold
+        for phase, over in ((29.9 + hold - 1.0, False), (30.1 + hold - 1.0, True)):
+            _, outcome = jit(env.step)(env.start(jnp.float32(phase)), STILL)
+            assert bool(outcome.truncated) == over and not bool(outcome.terminated)
+
+
 def test_tracking_pays_one_a_frame_on_the_reference(family: Environment):
     for variant in range(2):
         state = family.start(jnp.float32(3.0), jnp.int32(variant))
