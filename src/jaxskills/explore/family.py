@@ -58,6 +58,8 @@ class FamilyConfig:
     base_growth: float = 0.02  # share of the reward
     base_patience: int = 3  # updates
     base_memory: float = 0.7  # of the running means of both, with each update
+    # An episode counts as a success for the curriculum only with that share of the elites' fitness.
+    quality: float = 0.5
     # Of `ppo.target_kl` while refining. Large changes of the policy find new motions, small ones
     # perform the known ones well.
     refining_kl: float = 1.0
@@ -170,6 +172,7 @@ def update(
     keeping = roomy(config.elites, results.a.shape[1])
     elites, entered, counted = elites_lib.insert(keeping, family.elites, results.episodes)
     asked, batch = family.asked.a, family.asked.region.shape[0]
+    done = results.success * good(config, family.elites, results.episodes)
     found = jnp.zeros(batch).at[results.variant].add(counted)
     network = parameterization_lib.update(
         config.parameterization, family.network, elites, network_key
@@ -180,7 +183,7 @@ def update(
     curriculum = jax.lax.cond(
         family.base.learnt,
         lambda: curriculum_lib.update(
-            config.curriculum, family.curriculum, family.asked.region, found, results.success
+            config.curriculum, family.curriculum, family.asked.region, found, done
         ),
         lambda: family.curriculum,
     )
@@ -198,6 +201,14 @@ def update(
         base.learnt, lambda: _ask(config, keeping, family, ask_key), lambda: family
     )
     return family, watched(config, family, results, asked, entered, counted)
+
+
+def good(config: FamilyConfig, elites: Elites, episodes: Episodes) -> jax.Array:
+    """Returns which share `[]` of the episodes has so much of the mean fitness of the elites."""
+    total = jnp.sum(jnp.where(elites.used, elites.fitness, 0.0))
+    least = config.quality * total / jnp.maximum(jnp.sum(elites.used), 1)
+    passed = episodes.valid & (episodes.fitness >= least)
+    return jnp.sum(passed) / jnp.maximum(jnp.sum(episodes.valid), 1)
 
 
 def _ask(
@@ -314,7 +325,7 @@ def validate(config: FamilyConfig) -> None:
     """
     if not 1 <= config.episodes <= 100:
         raise UserError(f"family.episodes is {config.episodes}: give 1 to 100")
-    for name in ("late", "base_late", "base_success", "base_growth", "base_memory"):
+    for name in ("late", "base_late", "base_success", "base_growth", "base_memory", "quality"):
         if not 0 <= getattr(config, name) < 1:
             raise UserError(f"family.{name} is {getattr(config, name)}: give 0 <= {name} < 1")
     if not 0 < config.refining_kl <= 1:
