@@ -10,8 +10,9 @@ the box has jumped another distance on level ground.
 
 from jaxskills.env import measure, obstacles
 from jaxskills.env.task import Parameter, TaskSpec
+from jaxskills.motion import MotionConfig
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import for_family
+from jaxskills.trainer import TrainConfig, for_family
 
 _FAR = 1.07  # m that the clip jumps
 _BEGIN, _END = 0.01, 1.0  # shares of the clip, in the same pose
@@ -40,5 +41,6 @@ RECIPE = Recipe(
         ),
         scenery=(_FIRST, _SECOND),
     ),
-    config=for_family(),
+    # After the landing one stands, instead of crouching for the next jump.
+    config=for_family(TrainConfig(motion=MotionConfig(loop=False))),
 )

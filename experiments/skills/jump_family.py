@@ -3,8 +3,9 @@
 
 from jaxskills.env import conditions, measure
 from jaxskills.env.task import Parameter, TaskSpec
+from jaxskills.motion import MotionConfig
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import for_family
+from jaxskills.trainer import TrainConfig, for_family
 
 RECIPE = Recipe(
     name="jump_family",
@@ -23,5 +24,6 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=for_family(),
+    # After the landing one stands, instead of crouching for the next jump.
+    config=for_family(TrainConfig(motion=MotionConfig(loop=False))),
 )

@@ -8,8 +8,9 @@ the reference: a jump that ends in front of the hurdle, or on it, does not count
 
 from jaxskills.env import measure, obstacles
 from jaxskills.env.task import Parameter, TaskSpec
+from jaxskills.motion import MotionConfig
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import for_family
+from jaxskills.trainer import TrainConfig, for_family
 
 RECIPE = Recipe(
     name="obstacle_jump_family",
@@ -31,5 +32,6 @@ RECIPE = Recipe(
             ),
         )
     ),
-    config=for_family(),
+    # After the landing one stands, instead of crouching for the next jump.
+    config=for_family(TrainConfig(motion=MotionConfig(loop=False))),
 )

@@ -6,10 +6,9 @@ this clip, whose kick is 0.3 m higher than the paper's, for feet 2.7 m high.
 """
 
 from jaxskills.env import measure
-from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.recipes import Recipe
-from jaxskills.trainer import TrainConfig, for_family
+from jaxskills.trainer import for_family
 
 RECIPE = Recipe(
     name="spinkick_family",
@@ -33,6 +32,5 @@ RECIPE = Recipe(
             ),
         )
     ),
-    # The clip ends while it still turns, in a pose that cannot be held.
-    config=for_family(TrainConfig(env=EnvConfig(hold=3.0))),
+    config=for_family(),
 )

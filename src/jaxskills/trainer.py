@@ -76,17 +76,15 @@ def for_family(config: TrainConfig = TrainConfig()) -> TrainConfig:
 
     Rewards of FS 4.2, time warp of 4.1, the discount of 7; the noise of exploration is that of the
     authors' code, since with SB's a family does not find what lies beyond its region. These, that a
-    fall ends an episode, that the motion is done once, and the number of environments are set
-    whatever `config` has; bounds are wide unless it has its own; the rest of it stays.
+    fall ends an episode, and the number of environments are set whatever `config` has; bounds are
+    wide unless it has its own; the rest of it stays.
     """
     env = dataclasses.replace(config.env, reward="tracking", time_warp=True, stop="either")
     networks = dataclasses.replace(config.networks, noise=0.1)
     ppo = dataclasses.replace(config.ppo, discount=0.95)
     bounds = FAMILY_BOUNDS if config.bounds == bounds_lib.BoundsConfig() else config.bounds
-    # Whoever went on into the next cycle would have to take off again as soon as he has landed.
-    once = dataclasses.replace(config.motion, loop=False)
     changes = dataclasses.replace(config, env=env, networks=networks, ppo=ppo, bounds=bounds)
-    return dataclasses.replace(changes, motion=once, envs=160)
+    return dataclasses.replace(changes, envs=160)
 
 
 @struct.dataclass
