@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxskills.errors import UserError
+from jaxskills.explore import curriculum, family
 from jaxskills.explore import elites as elites_lib
-from jaxskills.explore import family
 from jaxskills.explore.curriculum import CurriculumConfig
 from jaxskills.explore.elites import EliteConfig, Episodes
 from jaxskills.explore.family import Family, FamilyConfig, Results
@@ -94,6 +94,31 @@ def test_new_elites_count_for_whoever_was_asked():
     state, seen = UPDATE(state, _results([0.4, 0.8, 0.6]), jax.random.key(9))
     assert (int(seen["entered"]), int(seen["counted"])) == (2, 2)
     assert float(jnp.abs(state.curriculum.rate - before).sum()) > 0.0
+
+
+def test_what_is_far_below_the_elites_is_no_success():
+    """Three of four episodes have at least half of the elites' fitness of 0.6 in the mean."""
+    kept = _results([0.1, 0.4, 0.7]).episodes
+    keep = family.roomy(CONFIG.elites, 1)
+    none = elites_lib.init(keep, 1, SIZE)
+    fit = dataclasses.replace(kept, fitness=jnp.array([0.5, 0.6, 0.7]))
+    elites, _, _ = elites_lib.insert(keep, none, fit)
+    many = _results([0.1, 0.2, 0.3, 0.4, 0.5]).episodes
+    many = dataclasses.replace(
+        many,
+        fitness=jnp.array([0.31, 0.29, 0.9, 0.301, 0.0]),
+        valid=jnp.array([True, True, True, True, False]),
+    )
+    assert float(family.good(CONFIG, elites, many)) == pytest.approx(0.75)
+    assert float(family.good(CONFIG, none, many)) == 1.0
+    state = _begin()
+    for i in range(8):
+        state, _ = UPDATE(state, _results([0.25, 0.4, 0.55]), jax.random.key(i))
+    assert int(state.curriculum.phase) == curriculum.EXPLORATION
+    for i in range(8):
+        poor = _results([0.25, 0.4, 0.55], fitness=0.4)
+        state, _ = UPDATE(state, poor, jax.random.key(20 + i))
+    assert int(state.curriculum.phase) == curriculum.REFINEMENT
 
 
 def test_small_changes_are_for_refinement_alone():
