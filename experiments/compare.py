@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 from reproduce import RESULTS, jaxskills, keep, reproduce
 
-from jaxskills import provenance
+from jaxskills import cli, clip, provenance, recipes
+from jaxskills.errors import UserError
 from jaxskills.judge import SURE_RATE
 
 
@@ -182,6 +183,8 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where run folders go")
     options = parser.parse_args()
     for name in options.names:
+        find_clips(name)
+    for name in options.names:
         for label, case in COMPARISONS[name].items():
             if (RESULTS / name / f"{label}.json").is_file():
                 print(f"{name}/{label} is there", file=sys.stderr)
@@ -198,6 +201,21 @@ def main() -> None:
             record = reproduce(case.skill, 0, run, (*case.options, *begin))
             record["gram_distances"] = {clip: gram_distance(run, clip) for clip in case.against}
             keep(record, run, RESULTS / name, label)
+
+
+def find_clips(name: str) -> None:
+    """Looks for all clips of a comparison, so that none is missed after hours of training.
+
+    Raises:
+      SystemExit: one is not there. What is missing was printed.
+    """
+    try:
+        for case in COMPARISONS[name].values():
+            for one in (recipes.find(case.skill).clip, *case.against):
+                clip.find(one)
+    except UserError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        raise SystemExit(cli.BAD_INPUT) from None
 
 
 def same(case: Case) -> list[Path]:

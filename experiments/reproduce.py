@@ -54,13 +54,13 @@ def reproduce(skill: str, seed: int, run: Path, options: tuple[str, ...] = ()) -
       options: of `jaxskills train`, besides.
 
     Raises:
-      SystemExit: the training was interrupted, so there is nothing to record yet.
+      SystemExit: the training was interrupted or never began, so there is nothing to record.
     """
     resumed = (run / "config.json").is_file()
     options = ("train", skill, "--seed", str(seed), *options, "--out", str(run))
     print(shlex.join(options), file=sys.stderr)
     code, seconds, first = train([*options, *["--resume"] * resumed])
-    if code == INTERRUPTED:
+    if code == INTERRUPTED or not (run / "metrics.jsonl").is_file():
         raise SystemExit(code)
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     last = rows[-1]

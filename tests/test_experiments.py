@@ -197,6 +197,20 @@ def test_the_ablations_are_what_they_are_called():
     assert {p.name for p in task.parameters if p.fixed} == {"energy", "foot_contact"}
 
 
+def test_a_clip_that_is_not_there_is_missed_before_training(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    compare = script("compare")
+    monkeypatch.delenv("JAXSKILLS_CLIP_DIR", raising=False)
+    monkeypatch.setattr("sys.argv", ["compare.py", "run_styles", "--runs", str(tmp_path)])
+    with pytest.raises(SystemExit) as end:
+        compare.main()
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and error.count("\n") == 1
+    assert "run_styles: unknown clip 'happy_walk'" in error
+    assert not list(tmp_path.iterdir())
+
+
 def test_each_comparison_can_be_trained():
     """Its skills are recipes, and its options are options of `train`."""
     for name, cases in script("compare").COMPARISONS.items():
