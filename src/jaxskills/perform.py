@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A trained family performs: one whole motion for each of some task parameters.
 
-Each begins on its own motion m_a at phase 0, on the body and in the world that the parameter asks
-for. Actions are the policy's mean, the motion is the one that is known best, so nothing is left to
-chance. As in an evaluation a performance ends with a fall, not where it leaves its bounds.
+Each begins as the reference does, on the body and in the world that the parameter asks for. Actions
+are the policy's mean, the motion is the one that is known best, so nothing is left to chance. As in
+an evaluation a performance ends with a fall, not where it leaves its bounds.
 """
 
 import dataclasses
