@@ -176,7 +176,6 @@ def practise(
     config, family = own.config, state.family
     assert family is not None
     env, base = environment(own, world, family.asked), ~family.base.learnt
-    share = family_lib.caution(config.family, family)
     begin_key, key = jax.random.split(key)
 
     def chunk(carry, key: jax.Array):
@@ -189,7 +188,7 @@ def practise(
         steps = dataclasses.replace(steps, spike=jnp.where(base, 0.0, steps.spike))
         batch = trainer.to_batch(config.ppo, nets, learner, normalizer, steps)
         value = nets.value(learner.value, batch.obs).reshape(steps.phase.shape)
-        learner, watched = ppo.update(config.ppo, nets, learner, batch, learn_key, share)
+        learner, watched = ppo.update(config.ppo, nets, learner, batch, learn_key)
         seen = normalize.update(normalizer, steps.obs.reshape(-1, steps.obs.shape[-1]))
         watched |= trainer.episode_metrics(env, steps)
         return (learner, pinned(own, seen), current), (_record(env, steps), value, watched)

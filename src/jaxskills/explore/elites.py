@@ -126,6 +126,12 @@ def density(config: EliteConfig, elites: Elites, a: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(elites.used, near, 0.0), axis=-1)
 
 
+def nearest_fitness(elites: Elites, a: jax.Array) -> jax.Array:
+    """Returns the fitness `[...]` of the elite nearest to `a [..., P]`, 0 without any."""
+    row = jnp.argmin(jnp.where(elites.used, _distance(elites.a.T, a), jnp.inf), axis=-1)
+    return jnp.where(elites.used, elites.fitness, 0.0)[row]
+
+
 def explored_ratio(
     config: EliteConfig, elites: Elites, level: float = 0.8, points: int = 1024
 ) -> jax.Array:

@@ -58,11 +58,9 @@ class FamilyConfig:
     base_growth: float = 0.02  # share of the reward
     base_patience: int = 3  # updates
     base_memory: float = 0.7  # of the running means of both, with each update
-    # An episode counts as a success for the curriculum only with that share of the elites' fitness.
+    # Of the fitness of the elite nearest to what was asked for, that an episode must have to count
+    # as a success for the curriculum.
     quality: float = 0.5
-    # Of `ppo.target_kl` while refining. Large changes of the policy find new motions, small ones
-    # perform the known ones well.
-    refining_kl: float = 1.0
     variation: VariationConfig = VariationConfig()
     elites: elites_lib.EliteConfig = elites_lib.EliteConfig()
     fitness: fitness_lib.FitnessConfig = fitness_lib.FitnessConfig()
@@ -172,7 +170,8 @@ def update(
     keeping = roomy(config.elites, results.a.shape[1])
     elites, entered, counted = elites_lib.insert(keeping, family.elites, results.episodes)
     asked, batch = family.asked.a, family.asked.region.shape[0]
-    done = results.success * good(config, family.elites, results.episodes)
+    wanted = asked[results.variant]
+    done = results.success * good(config, family.elites, results.episodes, wanted)
     found = jnp.zeros(batch).at[results.variant].add(counted)
     network = parameterization_lib.update(
         config.parameterization, family.network, elites, network_key
@@ -203,10 +202,13 @@ def update(
     return family, watched(config, family, results, asked, entered, counted)
 
 
-def good(config: FamilyConfig, elites: Elites, episodes: Episodes) -> jax.Array:
-    """Returns which share `[]` of the episodes has so much of the mean fitness of the elites."""
-    total = jnp.sum(jnp.where(elites.used, elites.fitness, 0.0))
-    least = config.quality * total / jnp.maximum(jnp.sum(elites.used), 1)
+def good(config: FamilyConfig, elites: Elites, episodes: Episodes, asked: jax.Array) -> jax.Array:
+    """Returns which share `[]` of the episodes is nearly as fit as the elites they should be like.
+
+    Those nearest to what was asked for, `asked [N, P]`: at the rim of what is explored elites are
+    less fit than inside.
+    """
+    least = config.quality * elites_lib.nearest_fitness(elites, asked)
     passed = episodes.valid & (episodes.fitness >= least)
     return jnp.sum(passed) / jnp.maximum(jnp.sum(episodes.valid), 1)
 
@@ -262,12 +264,6 @@ def _asked(
         jnp.where(family.base.learnt & config.vary, v, 0.0) for v in (x, performed(config, family))
     )
     return Asked(a, region, x, x - lag)
-
-
-def caution(config: FamilyConfig, family: Family) -> jax.Array:
-    """Returns the share `[]` of `ppo.target_kl` that the policy's changes aim at now."""
-    refining = family.base.learnt & (family.curriculum.phase == curriculum_lib.REFINEMENT)
-    return jnp.where(refining, config.refining_kl, 1.0)
 
 
 def _base(config: FamilyConfig, base: Base, results: Results) -> Base:
@@ -328,8 +324,6 @@ def validate(config: FamilyConfig) -> None:
     for name in ("late", "base_late", "base_success", "base_growth", "base_memory", "quality"):
         if not 0 <= getattr(config, name) < 1:
             raise UserError(f"family.{name} is {getattr(config, name)}: give 0 <= {name} < 1")
-    if not 0 < config.refining_kl <= 1:
-        raise UserError(f"family.refining_kl is {config.refining_kl}: give 0 < refining_kl <= 1")
     if config.base_patience < 0:
         raise UserError(f"family.base_patience is {config.base_patience}: give 0 or more")
     elites_lib.validate(config.elites)

@@ -94,17 +94,11 @@ def value_loss(params: Params, networks: Networks, batch: Batch) -> jax.Array:
 
 
 def update(
-    config: PPOConfig,
-    networks: Networks,
-    learner: Learner,
-    batch: Batch,
-    key: jax.Array,
-    share: jax.Array | float = 1.0,
+    config: PPOConfig, networks: Networks, learner: Learner, batch: Batch, key: jax.Array
 ) -> tuple[Learner, dict[str, jax.Array]]:
     """Returns the learner after `epochs` passes over the batch, and means of what to watch.
 
-    The key is consumed by the order of the minibatches. `share []` of `target_kl` is what the step
-    size follows.
+    The key is consumed by the order of the minibatches.
     """
     policy_opt, value_opt = optimizers(config)
     size = batch.log_prob.shape[0]
@@ -128,7 +122,7 @@ def update(
     order = jax.vmap(lambda k: jax.random.permutation(k, size))(keys)
     rows = order[:, : count * config.minibatch].reshape(-1, config.minibatch)
     learner, watched = jax.lax.scan(minibatch_step, learner, rows)
-    lr = next_lr(config, learner.policy_lr, jnp.mean(watched["kl"][-count:]) / share)
+    lr = next_lr(config, learner.policy_lr, jnp.mean(watched["kl"][-count:]))
     learner = dataclasses.replace(learner, policy_lr=lr)
     return learner, jax.tree.map(jnp.mean, watched) | {"policy_lr": lr}
 
