@@ -70,11 +70,13 @@ def _styles(name: str, skill: str, samples: int) -> dict[str, Case]:
     return cases
 
 
-def _transfers(name: str, skill: str, clips: tuple[str, ...], samples: int) -> dict[str, Case]:
-    """The style transfer of SB 5.3.2, and the skill without it in the same bounds."""
+def _transfers(
+    name: str, skill: str, loose: str, clips: tuple[str, ...], samples: int
+) -> dict[str, Case]:
+    """The style transfer of SB 5.3.2: the skill, and in `loose` bounds with each clip's style."""
     gram = f"{_STYLED} --env.reward style --env.style.style gram --env.style.style-clip"
     cases = {"plain": Case(skill, _of(f"--samples {samples}"), clips)}
-    styled = {one: Case(skill, _of(f"{gram} {one}"), clips, f"{name}/plain") for one in clips}
+    styled = {one: Case(loose, _of(f"{gram} {one}"), clips, f"{name}/plain") for one in clips}
     return cases | styled
 
 
@@ -161,7 +163,9 @@ COMPARISONS: dict[str, dict[str, Case]] = {
     "sparse_high_knees": _poor("sparse_high_knees", 2_000_000),
     "cartwheel_styles": _styles("cartwheel_styles", "cartwheel_style", 4_000_000),
     "dance_styles": _styles("dance_styles", "dance_style", 5_000_000),
-    "run_styles": _transfers("run_styles", "run_style", ("happy_walk", "bent_walk"), 4_000_000),
+    "run_styles": _transfers(
+        "run_styles", "run", "run_style", ("happy_walk", "bent_walk"), 4_000_000
+    ),
     "cartwheel_blend": _blends("cartwheel_style", "energy_down", "cartwheel_styles/plain"),
     # Families of skills
     "spinkick_ablation": _ablation("spinkick_family", 2_000_000),
