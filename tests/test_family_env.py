@@ -17,7 +17,6 @@ from jaxskills.env.bounds import BoundsConfig
 from jaxskills.env.core import EnvConfig, Environment
 from jaxskills.env.task import Parameter, TaskSpec
 from jaxskills.motion import Motion
-from jaxskills.physics import Physics, SimState
 from jaxskills.variation import Variation
 
 HEIGHT = Parameter("height", (0.5, 1.5), measure=measure.at(0.5, measure.com_height), sigma=0.2)
@@ -45,13 +44,6 @@ def _raised(who: Character, stand: Motion, height: float, tau: float) -> Variati
 
 def _family(who: Character, stand: Motion, config: EnvConfig, asked: bool = True) -> Environment:
     """Returns two variants, the second 0.3 m higher and faster; nothing ever moves in them."""
-    stopped = Physics(
-        load=lambda models: None,
-        init=lambda model, variant, qpos, qvel: SimState(
-            qpos, qvel, jnp.zeros(5), jnp.bool_(False)
-        ),
-        step=lambda model, variant, state, ctrl: dataclasses.replace(state, engine=ctrl),
-    )
     rows = []
     for height, tau, a in ((0.0, 0.0, 0.5), (0.3, 0.2, 0.75)):
         made = _raised(who, stand, height, tau)
@@ -59,7 +51,7 @@ def _family(who: Character, stand: Motion, config: EnvConfig, asked: bool = True
         rows.append(variants.row(who, shown, made, jnp.array([a])))
     asks = task.make(TaskSpec((HEIGHT,)), who, stand) if asked else None
     both = variants.stack(rows, None)
-    return core.make(who, both, stopped, bounds.make(who, WIDE), config, task=asks)
+    return core.make(who, both, tiny.stopped(), bounds.make(who, WIDE), config, task=asks)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,8 @@ from jaxskills.env.core import EnvConfig
 from jaxskills.env.style import StyleConfig
 from jaxskills.errors import UserError
 from jaxskills.motion import Motion, sample
-from jaxskills.physics import Physics, SimState
+from jaxskills.physics import Physics
+from jaxskills.physics.base import SimState, start
 
 WIDTH, CHANNELS = 4, 6
 ALPHA = 0.4
@@ -211,11 +212,11 @@ def _puppet(who: Character, pulled: Motion) -> Physics:
     """Returns an engine whose character is pulled along a motion, whatever the controls."""
 
     def step(model: object, variant: jax.Array, state: SimState, ctrl: jax.Array) -> SimState:
-        moved = sample(who.layout, pulled, state.engine + 1.0)
-        return SimState(*moved, state.engine + 1.0, jnp.bool_(False))
+        moved = sample(who.layout, pulled, state.qacc[0] + 1.0)
+        return SimState(*moved, state.qacc + 1.0, jnp.bool_(False))
 
     def init(model: object, variant: jax.Array, qpos: jax.Array, qvel: jax.Array) -> SimState:
-        return SimState(qpos, qvel, jnp.float32(0.0), jnp.bool_(False))
+        return start(qpos, qvel)
 
     return Physics(load=lambda models: None, init=init, step=step)
 
@@ -292,7 +293,7 @@ def test_a_diverged_window_earns_nothing(hopping):
     state = hopping.start(jnp.float32(0.0))
     broken = dataclasses.replace(
         state,
-        sim=dataclasses.replace(state.sim, engine=jnp.float32(jnp.nan)),
+        sim=dataclasses.replace(state.sim, qacc=jnp.full(11, jnp.nan)),
         window=jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), state.window),
     )
     _, outcome = hopping.step(broken, jnp.zeros(5))

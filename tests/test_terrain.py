@@ -17,7 +17,6 @@ from jaxskills.env import bounds, core, obstacles, variants
 from jaxskills.env.core import EnvConfig
 from jaxskills.env.task import TaskSpec, placed
 from jaxskills.kinematics import Bodies
-from jaxskills.physics import Physics, SimState
 
 INF = float("inf")
 
@@ -128,17 +127,10 @@ def who(plain: Character) -> Character:
 @pytest.fixture(scope="module")
 def env(who: Character) -> core.Environment:
     """Nothing ever moves in it."""
-    stopped = Physics(
-        load=lambda models: None,
-        init=lambda model, variant, qpos, qvel: SimState(
-            qpos, qvel, jnp.zeros(5), jnp.bool_(False)
-        ),
-        step=lambda model, variant, state, ctrl: state,
-    )
     stand = tiny.make_motion(who, tiny.standing(), False)
     rows = variants.one(who, stand, None)
     made = core.make(
-        who, rows, stopped, bounds.make(who, bounds.BoundsConfig()), EnvConfig(stop="fall")
+        who, rows, tiny.stopped(), bounds.make(who, bounds.BoundsConfig()), EnvConfig(stop="fall")
     )
     return made._replace(place=jit(made.place), step=jit(made.step))
 

@@ -20,6 +20,7 @@ from jaxskills.learn.networks import NetworkConfig
 from jaxskills.learn.ppo import PPOConfig
 from jaxskills.motion import Motion
 from jaxskills.physics import Physics
+from jaxskills.physics.base import SimState, start
 from jaxskills.trainer import TrainConfig
 
 _XML = """
@@ -120,6 +121,22 @@ def make_physics(who: Character, substeps: int = 4) -> tuple[Physics, object]:
     """Returns the cpu physics on one thread and the model loaded for `substeps` a control step."""
     engine = physics_lib.make("cpu", 1, num_envs=1, threads=1)
     return engine, engine.load([character.compile(who, motion.CONTROL_DT / substeps)])
+
+
+def stopped() -> Physics:
+    """Returns an engine in which nothing ever moves.
+
+    It keeps the controls where the accelerations of the last coordinates would be.
+    """
+
+    def step(model: object, variant: jax.Array, state: SimState, ctrl: jax.Array) -> SimState:
+        return state.replace(qacc=jnp.zeros_like(state.qvel).at[-ctrl.size :].set(ctrl))
+
+    return Physics(
+        load=lambda models: None,
+        init=lambda model, variant, qpos, qvel: start(qpos, qvel),
+        step=step,
+    )
 
 
 def make_env(

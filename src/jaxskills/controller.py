@@ -184,7 +184,7 @@ def _moved(sim: SimState, turn: jax.Array, shift: jax.Array) -> SimState:
     qpos = jnp.concatenate((pos, rotation.mul(about, sim.qpos[3:7]), sim.qpos[7:]))
     # The root's linear velocity is in the world, its angular one in its own frame.
     first = lambda v: jnp.concatenate((rotation.rotate(about, v[:3]), v[3:]))  # noqa: E731
-    return dataclasses.replace(sim, qpos=qpos, qvel=first(sim.qvel), engine=first(sim.engine))
+    return dataclasses.replace(sim, qpos=qpos, qvel=first(sim.qvel), qacc=first(sim.qacc))
 
 
 def _in_world(playing: Playing, qpos: jax.Array) -> jax.Array:

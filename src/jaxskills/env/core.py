@@ -269,7 +269,7 @@ def make(
         sim, told = around(state, taken[0])
 
         def substep(sim: SimState, _: None) -> tuple[SimState, jax.Array]:
-            ctrl = servo.controls(servos, layout, sim.qpos, sim.qvel, target, speed)
+            ctrl = servo.controls(servos, layout, sim, target, speed, CONTROL_DT / config.substeps)
             whole = jnp.concatenate((*told, ctrl))
             return physics.step(variants.model, state.variant, sim, whole), ctrl
 

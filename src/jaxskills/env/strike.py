@@ -104,7 +104,7 @@ def reference_impact(config: Target, end: float, character: Character, motion: M
         goal, speed = sample(layout, motion, phase + 1.0)
 
         def substep(sim, _: None):
-            ctrl = servo.controls(servos, layout, sim.qpos, sim.qvel, goal, speed)
+            ctrl = servo.controls(servos, layout, sim, goal, speed, CONTROL_DT / _SUBSTEPS)
             return engine.step(model, variant, sim, jnp.concatenate((more, ctrl))), None
 
         sim, _ = jax.lax.scan(substep, sim, None, length=_SUBSTEPS)

@@ -27,14 +27,15 @@ class SimState:
     Attributes:
       qpos: [nq] float32, MuJoCo coordinates (m, rad, quaternions wxyz). Finite after a step.
       qvel: [nv] float32, velocities (m/s, rad/s). Finite after a step.
-      engine: what the backend carries besides: [nv] float32, the solver's `qacc_warmstart`.
+      qacc: [nv] float32, acceleration of the last physics step, from which the solver starts the
+        next; 0 at first.
       diverged: [] bool, true once a step failed: qpos and qvel are then those before it, not a
         simulation. It stays true until `init`.
     """
 
     qpos: jax.Array
     qvel: jax.Array
-    engine: Any
+    qacc: jax.Array
     diverged: jax.Array
 
 
@@ -60,7 +61,7 @@ def start(qpos: jax.Array, qvel: jax.Array) -> SimState:
     return SimState(
         qpos=jnp.asarray(qpos, jnp.float32),
         qvel=qvel,
-        engine=jnp.zeros_like(qvel),
+        qacc=jnp.zeros_like(qvel),
         diverged=jnp.zeros((), bool),
     )
 
@@ -75,12 +76,12 @@ def admit(home: jax.Array, state: SimState, ctrl: jax.Array) -> tuple[SimState, 
 
     The returned state is marked as diverged where anything was replaced.
     """
-    ok = sound(state.qpos, state.qvel, state.engine)
+    ok = sound(state.qpos, state.qvel, state.qacc)
     commanded = sound(ctrl)
     admitted = SimState(
         qpos=jnp.where(ok, state.qpos, home),
         qvel=jnp.where(ok, state.qvel, 0.0),
-        engine=jnp.where(ok, state.engine, 0.0),
+        qacc=jnp.where(ok, state.qacc, 0.0),
         diverged=state.diverged | ~ok | ~commanded,
     )
     return admitted, jnp.where(commanded, ctrl, 0.0)
@@ -88,7 +89,7 @@ def admit(home: jax.Array, state: SimState, ctrl: jax.Array) -> tuple[SimState, 
 
 def settle(before: SimState, after: SimState) -> SimState:
     """Returns `after`, or `before` marked as diverged where either of them is unsound."""
-    ok = sound(after.qpos, after.qvel, after.engine) & ~after.diverged & ~before.diverged
+    ok = sound(after.qpos, after.qvel, after.qacc) & ~after.diverged & ~before.diverged
     kept = jax.tree.map(lambda new, old: jnp.where(ok, new, old), after, before)
     return kept.replace(diverged=~ok)
 

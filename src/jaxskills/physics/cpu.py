@@ -175,10 +175,10 @@ def _assign(runner: _Runner, models: tuple[mujoco.MjModel, ...], variant: np.nda
 
 def _call(job, variant, state: SimState, ctrl, use_ffi: bool) -> SimState:
     outputs = [
-        jax.ShapeDtypeStruct(x.shape, jnp.float32) for x in (state.qpos, state.qvel, state.engine)
+        jax.ShapeDtypeStruct(x.shape, jnp.float32) for x in (state.qpos, state.qvel, state.qacc)
     ]
     outputs.append(jax.ShapeDtypeStruct((), jnp.bool_))
-    arguments = (job, jnp.asarray(variant, jnp.int32), state.qpos, state.qvel, state.engine, ctrl)
+    arguments = (job, jnp.asarray(variant, jnp.int32), state.qpos, state.qvel, state.qacc, ctrl)
     if use_ffi:
         function = jax.ffi.ffi_call(TARGET, outputs, vmap_method="broadcast_all")
         return SimState(*function(*arguments))

@@ -172,14 +172,14 @@ def _advance(world: tuple[mjx.Model, mjx.Data], state: SimState, ctrl: Any, subs
             data = mjx.step(model, data)
         return data.qpos, data.qvel, data.qacc_warmstart
 
-    end = jax.lax.fori_loop(0, substeps, substep, (state.qpos, state.qvel, state.engine))
+    end = jax.lax.fori_loop(0, substeps, substep, (state.qpos, state.qvel, state.qacc))
     return SimState(*end, diverged=jnp.zeros((), bool))
 
 
 def _advance_warp(world: tuple[mjx.Model, mjx.Data], state: SimState, ctrl: Any, substeps: int):
     """Steps Warp's own Data, since its buffers are better kept than filled anew each substep."""
     model, data = world
-    data = data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.engine, ctrl=ctrl)
+    data = data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc, ctrl=ctrl)
     overflow = jnp.zeros((), bool)
     for _ in range(substeps):
         data = mjx.step(model, data)
