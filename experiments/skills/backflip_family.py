@@ -34,8 +34,11 @@ RECIPE = Recipe(
             ),
         )
     ),
-    # Its turning in flight is not that of a thrown body: see the recipe of the backflip alone.
+    # Its turning in flight is not that of a thrown body: see the recipe of the backflip alone. It
+    # is done once: after the landing one stands, instead of crouching for the next flip.
     config=for_family(
-        TrainConfig(env=EnvConfig(heading="lateral"), motion=MotionConfig(ballistic=True))
+        TrainConfig(
+            env=EnvConfig(heading="lateral"), motion=MotionConfig(ballistic=True, loop=False)
+        )
     ),
 )
