@@ -171,7 +171,7 @@ def update(
     elites, entered, counted = elites_lib.insert(keeping, family.elites, results.episodes)
     asked, batch = family.asked.a, family.asked.region.shape[0]
     wanted = asked[results.variant]
-    done = results.success * good(config, family.elites, results.episodes, wanted)
+    done = jnp.minimum(results.success, good(config, family.elites, results.episodes, wanted))
     found = jnp.zeros(batch).at[results.variant].add(counted)
     network = parameterization_lib.update(
         config.parameterization, family.network, elites, network_key
