@@ -30,7 +30,8 @@ env.worlds env.core env
 learn.networks learn.normalize learn.windows learn.autoencoder learn.gae learn.ppo learn.rollout
 learn
 explore.starts explore.evolution explore.adaptive explore.refine explore.fitness explore.elites
-explore.parameterization explore.marginal explore.sampling explore.curriculum explore.family
+explore.parameterization explore.marginal explore.sampling explore.curriculum explore.lean
+explore.family
 explore.episodes explore
 
 trainer recipes families checkpoint runs warm_start evaluate perform evaluate_family controller

@@ -29,6 +29,7 @@ from jaxskills.env.worlds import World
 from jaxskills.errors import UserError
 from jaxskills.explore import episodes, fitness
 from jaxskills.explore import family as family_lib
+from jaxskills.explore import lean as lean_lib
 from jaxskills.explore import refine as refine_lib
 from jaxskills.explore import starts as starts_lib
 from jaxskills.explore.episodes import Record
@@ -227,8 +228,12 @@ def take_stock(
         episodes.room(steps, config.envs, round(float(own.shown.length) / 2)),
     )
     results = _results(family.asked.a[slot], practice, found)
-    family, seen = family_lib.update(config.family, family, results, key)
-    return dataclasses.replace(state, family=family), seen
+    stock_key, lean_key = jax.random.split(key)
+    family, seen = family_lib.update(config.family, family, results, stock_key)
+    asked = family.asked
+    x = lean_lib.lean(config.family.lean, asked.x, own.character.layout.own.nv, lean_key)
+    asked = dataclasses.replace(asked, x=x, fed=asked.fed + x - asked.x)
+    return dataclasses.replace(state, family=dataclasses.replace(family, asked=asked)), seen
 
 
 def _begin(own: Parts, env: core.Environment, base: jax.Array, key: jax.Array) -> rollout.Fresh:

@@ -17,6 +17,7 @@ from jaxskills.errors import UserError
 from jaxskills.explore import curriculum as curriculum_lib
 from jaxskills.explore import elites as elites_lib
 from jaxskills.explore import fitness as fitness_lib
+from jaxskills.explore import lean as lean_lib
 from jaxskills.explore import marginal as marginal_lib
 from jaxskills.explore import parameterization as parameterization_lib
 from jaxskills.explore.elites import Elites, Episodes
@@ -69,6 +70,7 @@ class FamilyConfig:
     )
     curriculum: curriculum_lib.CurriculumConfig = curriculum_lib.CurriculumConfig()
     marginal: marginal_lib.MarginalConfig = marginal_lib.MarginalConfig()
+    lean: lean_lib.LeanConfig = lean_lib.LeanConfig()
 
 
 @struct.dataclass
@@ -331,3 +333,4 @@ def validate(config: FamilyConfig) -> None:
     parameterization_lib.validate(config.parameterization)
     curriculum_lib.validate(config.curriculum)
     marginal_lib.validate(config.marginal)
+    lean_lib.validate(config.lean)
